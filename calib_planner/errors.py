@@ -1,0 +1,86 @@
+"""One root for everything this package refuses, so that a caller needs one ``except``.
+
+Every child carries its data as attributes (never only as prose) and its text says four things: which
+field, what was got, what is valid, and what to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+
+
+class CalibPlannerError(Exception):
+    """Root of all errors raised on purpose by calib_planner."""
+
+
+class InputError(CalibPlannerError, ValueError):
+    """A value from outside is not usable.
+
+    Attributes:
+        field: Name of the argument, key, column or parameter at fault.
+        got: What came in, as text.
+        expected: What would have been valid, as text.
+        advice: What to do about it; may be empty.
+    """
+
+    def __init__(self, field: str, got: object, expected: str, advice: str = "") -> None:
+        self.field = field
+        self.got = str(got)
+        self.expected = expected
+        self.advice = advice
+        text = f"{field}: expected {expected}, got {self.got}"
+        super().__init__(f"{text}; {advice}" if advice else text)
+
+
+class UnknownNameError(InputError):
+    """A name is not among the valid ones.
+
+    Attributes:
+        valid: The valid names.
+    """
+
+    def __init__(self, field: str, got: str, valid: Sequence[str]) -> None:
+        self.valid = tuple(valid)
+        close = get_close_matches(got, self.valid, n=1)
+        advice = f"did you mean {close[0]!r}?" if close else "use one of the valid names"
+        names = ", ".join(self.valid) if self.valid else "(there are none)"
+        super().__init__(field, repr(got), f"one of: {names}", advice)
+
+
+class FileFormatError(InputError):
+    """A file exists but cannot be read as what it should be.
+
+    Attributes:
+        path: The file.
+    """
+
+    def __init__(self, path: object, field: str, got: object, expected: str, advice: str = "") -> None:
+        self.path = str(path)
+        super().__init__(f"{path}: {field}", got, expected, advice)
+
+
+class InfeasibleError(CalibPlannerError):
+    """The request is well formed but nothing satisfies it.
+
+    Attributes:
+        constraint: Name of the constraint that empties the set of answers.
+    """
+
+    def __init__(self, constraint: str, message: str) -> None:
+        self.constraint = constraint
+        super().__init__(f"{constraint}: {message}")
+
+
+class NotEnoughDataError(CalibPlannerError):
+    """The data cannot determine what is asked, whatever their values.
+
+    Attributes:
+        have: Number of scalar equations at hand.
+        need: Number of scalar equations required.
+    """
+
+    def __init__(self, have: int, need: int, message: str) -> None:
+        self.have = have
+        self.need = need
+        super().__init__(message)

@@ -1,0 +1,284 @@
+"""The robot: eq. (1) and (2), a serial chain of elementary transforms with named parameters.
+
+A ``Robot`` never changes. ``with_parameters``, ``with_base``, ``with_targets`` and ``with_deviations`` return
+another robot. All geometric parameters that a robot could have are in its elements from the start; those not
+asked for are constants, and constants that are zero cost nothing (see ``program``).
+
+Frames: positions are in the *base frame of the chain's first element*: the robot's base, or the tracker's
+frame once the base pose has been set. Order of joints: ``joint_names``. Order of parameters:
+``parameter_names``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_planner._arrays import FloatArray, check_array, check_configurations, frozen
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.robot.elements import Element, rotation
+from calib_planner.robot.linearisation import Layout, Linearisation
+from calib_planner.robot.parameters import Parameter, resolve_parameters
+from calib_planner.robot.program import Program, compile_program, structure_of
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial robot with one or more targets at its tip.
+
+    Attributes:
+        name: Short name.
+        elements: The trunk, base pose first, up to the tip.
+        targets: Per target the three translations from the tip, in the tip's frame.
+        joint_names: Names in joint order.
+        joint_limits: (joints, 2) lower and upper [rad | m].
+        levels: Level name → parameter names.
+        parameter_names: Active parameters, the order of all Jacobian columns.
+        source: What the robot was read from.
+    """
+
+    name: str
+    elements: tuple[Element, ...]
+    targets: tuple[tuple[Element, ...], ...]
+    joint_names: tuple[str, ...]
+    joint_limits: FloatArray
+    levels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    parameter_names: tuple[str, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        joints = [e.joint for e in self.elements if e.joint is not None]
+        if sorted(joints) != list(range(len(self.joint_names))):
+            raise InputError(
+                "elements", f"joints {sorted(joints)}", "every joint to move exactly one element"
+            )
+        limits = check_array("joint_limits", self.joint_limits, (len(self.joint_names), 2))
+        for name, (low, high) in zip(self.joint_names, limits, strict=True):
+            if not low < high:
+                raise InputError(f"joint_limits of {name}", f"[{low}, {high}]", "lower < upper")
+        object.__setattr__(self, "joint_limits", limits)
+        names = [e.parameter for e in self._flat if e.parameter]
+        doubled = sorted({n for n in names if names.count(n) > 1})
+        if doubled:
+            raise InputError("elements", ", ".join(doubled), "each parameter name once")
+        for name in self.parameter_names:
+            if name not in names:
+                raise UnknownNameError("parameters", name, names)
+
+    # ── making ───────────────────────────────────────────────────────────────────────────────────────
+
+    @staticmethod
+    def load(
+        source: str | Path, *, base_link: str | None = None, tip_link: str | None = None
+    ) -> Robot:
+        """Load a shipped robot by name, or a robot YAML or URDF by path.
+
+        Raises:
+            UnknownNameError: No shipped robot or file of that name.
+            FileFormatError: The file does not parse; names the key or element at fault.
+        """
+        from calib_planner.robot.catalogue import load_robot
+
+        return load_robot(source, base_link=base_link, tip_link=tip_link)
+
+    def with_parameters(
+        self, request: str | Sequence[str], unknown: Iterable[str] = ()
+    ) -> Robot:
+        """The same robot with other active parameters; see ``parameters.resolve_parameters``."""
+        names = resolve_parameters(
+            request, unknown, self.available_parameters, self.levels, len(self.targets)
+        )
+        return replace(self, parameter_names=names)
+
+    def with_deviations(self, deviations: Mapping[str, float]) -> Robot:
+        """The robot whose named parameters are nominal + deviation [m | rad]."""
+        known = self._by_name
+        for name in deviations:
+            if name not in known:
+                raise UnknownNameError("deviations", name, self.available_parameters)
+
+        def moved(e: Element) -> Element:
+            delta = deviations.get(e.parameter or "", 0.0)
+            return replace(e, value=e.value + float(delta)) if delta else e
+
+        return replace(
+            self,
+            elements=tuple(map(moved, self.elements)),
+            targets=tuple(tuple(map(moved, branch)) for branch in self.targets),
+        )
+
+    def with_base(self, rotation_matrix: ArrayLike, xyz: ArrayLike) -> Robot:
+        """The robot placed at ``xyz`` [m] with axes ``rotation_matrix`` (3, 3), e.g. in the tracker's frame."""
+        matrix = check_array("rotation_matrix", rotation_matrix, (3, 3))
+        offset = check_array("xyz", xyz, (3,))
+        yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+        pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
+        # The rest about x, taken from what yaw and pitch leave: exact also where pitch is ±90°.
+        rest = rotation(1, pitch).T @ rotation(2, yaw).T @ matrix
+        roll = np.arctan2(rest[2, 1], rest[1, 1])
+        values = [*offset, yaw, pitch, roll, 0.0, 0.0, 0.0]
+        head = tuple(
+            replace(e, value=float(v)) for e, v in zip(self.elements[:9], values, strict=True)
+        )
+        return replace(self, elements=head + self.elements[9:])
+
+    def with_targets(self, xyz: ArrayLike) -> Robot:
+        """The robot with targets at ``xyz``, shape (targets, 3), in the tip's frame [m]."""
+        return replace(self, targets=target_elements(check_array("targets", xyz, (None, 3))))
+
+    # ── what it is ───────────────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def _flat(self) -> tuple[Element, ...]:
+        return self.elements + tuple(e for branch in self.targets for e in branch)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Parameter]:
+        return {
+            e.parameter: Parameter(e.parameter, e.unit, e.value, i)
+            for i, e in enumerate(self._flat)
+            if e.parameter
+        }
+
+    @property
+    def available_parameters(self) -> tuple[str, ...]:
+        """Names of all parameters that can be made active, in chain order."""
+        return tuple(self._by_name)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The active parameters, in the order of the Jacobian's columns."""
+        return tuple(self._by_name[n] for n in self.parameter_names)
+
+    @cached_property
+    def base_pose(self) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and position (3,) [m] of the base, its placement parameters included."""
+        matrix = np.eye(3)
+        for e in self.elements[3:9]:
+            matrix = matrix @ rotation(e.axis, e.sign * e.value)
+        return frozen(matrix), frozen(np.array([e.value for e in self.elements[:3]]))
+
+    @property
+    def target_offsets(self) -> FloatArray:
+        """(targets, 3) target positions in the tip's frame [m]."""
+        return np.array([[e.value for e in branch] for branch in self.targets])
+
+    # ── where things are ─────────────────────────────────────────────────────────────────────────────
+
+    def positions(self, q: ArrayLike, deviations: ArrayLike | None = None) -> FloatArray:
+        """Target positions, eq. (1).
+
+        Args:
+            q: (N, joints) or (joints,) joint coordinates in the order of ``joint_names`` [rad | m].
+            deviations: (P,) deviations of the active parameters from nominal [m | rad]; default zero.
+
+        Returns:
+            (N, targets, 3) positions in the base frame [m].
+
+        Raises:
+            InputError: Wrong shape or not finite.
+        """
+        rows = self._run(self._check_q(q), self._check_deviations(deviations), columns=False)
+        return rows.reshape(len(self.targets), 3, -1).transpose(2, 0, 1)
+
+    def jacobian(self, q: ArrayLike, deviations: ArrayLike | None = None) -> FloatArray:
+        """Identification Jacobian of eq. (3): ∂position/∂parameter.
+
+        Arguments and errors as for ``positions``.
+
+        Returns:
+            (N, 3·targets, P): rows x, y, z target by target, columns in the order of ``parameter_names``,
+            base frame [m/m | m/rad].
+        """
+        return self.positions_and_jacobian(q, deviations)[1]
+
+    def positions_and_jacobian(
+        self, q: ArrayLike, deviations: ArrayLike | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Both at the cost of one; see ``positions`` and ``jacobian``."""
+        rows = self._run(self._check_q(q), self._check_deviations(deviations), columns=True)
+        t = len(self.targets)
+        points = rows[: 3 * t].reshape(t, 3, -1).transpose(2, 0, 1)
+        columns = rows[3 * t :].reshape(len(self.parameter_names), 3 * t, -1)
+        return points, columns.transpose(2, 1, 0)
+
+    def linearise(self, q: ArrayLike, deviations: ArrayLike | None = None) -> Linearisation:
+        """Positions, parameter and joint columns and axes at once; see ``Linearisation``."""
+        return self._linearise(self._check_q(q), self._check_deviations(deviations))
+
+    def joint_jacobian(self, q: ArrayLike, deviations: ArrayLike | None = None) -> FloatArray:
+        """∂position/∂joint, shape (N, 3·targets, joints) [m/rad | 1], base frame."""
+        columns = self.linearise(q, deviations).joint_columns
+        return columns.reshape(len(self.joint_names), 3 * len(self.targets), -1).transpose(2, 1, 0)
+
+    # ── inside: arrays are clean from here on ────────────────────────────────────────────────────────
+
+    def _check_q(self, q: ArrayLike) -> FloatArray:
+        return check_configurations("configurations", q, self.joint_names)
+
+    def _check_deviations(self, deviations: ArrayLike | None) -> FloatArray:
+        if deviations is None:
+            return np.zeros(len(self.parameter_names))
+        meaning = f"deviations of {', '.join(self.parameter_names)}"
+        return check_array("deviations", deviations, (len(self.parameter_names),), meaning=meaning)
+
+    @cached_property
+    def _layout(self) -> Layout:
+        joint_elements = {e.joint: i for i, e in enumerate(self.elements) if e.joint is not None}
+        at = tuple(p.element for p in self.parameters)
+        joints = tuple(joint_elements[k] for k in range(len(self.joint_names)))
+        return Layout(
+            at,
+            tuple(self._flat[i].is_rotation for i in at),
+            joints,
+            tuple(self._flat[i].is_rotation for i in joints),
+        )
+
+    @cached_property
+    def _nominal_amounts(self) -> FloatArray:
+        return frozen(np.array([e.value for e in self._flat]))
+
+    def _program(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
+        return compile_program(structure_of(self.elements, self.targets, amounts, columns, axes))
+
+    def _amounts(self, deviations: NDArray[Any]) -> NDArray[Any]:
+        if not deviations.any():
+            return self._nominal_amounts
+        amounts = self._nominal_amounts.astype(np.result_type(deviations, np.float64))
+        amounts[list(self._layout.parameter_elements)] += deviations
+        return amounts
+
+    def _run(self, q: NDArray[Any], deviations: NDArray[Any], *, columns: bool) -> NDArray[Any]:
+        """Rows of the program; ``q`` (N, joints), real or complex."""
+        amounts = self._amounts(deviations)
+        wanted = self._layout.parameter_elements if columns else ()
+        return self._program(amounts, wanted, ()).run(np.ascontiguousarray(q.T), amounts)
+
+    def _linearise(self, q: NDArray[Any], deviations: NDArray[Any]) -> Linearisation:
+        lay = self._layout
+        amounts = self._amounts(deviations)
+        both = lay.parameter_elements + lay.joint_elements
+        rows = self._program(amounts, both, both).run(np.ascontiguousarray(q.T), amounts)
+        t, p, n = len(self.targets), len(lay.parameter_elements), q.shape[0]
+        split = 3 * t * (1 + len(both))
+        columns = rows[3 * t : split].reshape(len(both), t, 3, n)
+        axes = rows[split:].reshape(len(both), 3, n)
+        points = rows[: 3 * t].reshape(t, 3, n)
+        return Linearisation(points, columns[:p], columns[p:], axes[:p], axes[p:], lay)
+
+
+def target_elements(xyz: FloatArray) -> tuple[tuple[Element, ...], ...]:
+    """Branches from the tip to targets at ``xyz`` (targets, 3) [m], with parameters target_k.x, .y, .z."""
+    return tuple(
+        tuple(
+            Element("T" + a, float(v), parameter=f"target_{t}.{a}")
+            for a, v in zip("xyz", row, strict=True)
+        )
+        for t, row in enumerate(xyz, start=1)
+    )

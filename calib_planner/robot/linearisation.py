@@ -1,0 +1,114 @@
+"""How points move with parameters and joints at a batch of configurations: eq. (3) and one order beyond.
+
+From the axes w_e and columns of the elements (see ``program``) with e_a the element of parameter a and e_k
+that of joint k, both rotations:
+
+    ∂J_a/∂q_k = w_k × J_a     where e_k is before or at e_a,
+                w_a × J_k     where e_a is before e_k,
+
+a term with a translation in front being zero. For a scalar f(J) with G_a = ∂f/∂J_a the triple product turns
+the gradient in q into running sums over the parameters in chain order, no second derivative ever stored:
+
+    ∂f/∂q_k = w_k · Σ_{a at or behind k} J_a × G_a  +  J_k · Σ_{a before k, rotation} G_a × w_a .
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where parameters and joints sit in the chain.
+
+    Attributes:
+        parameter_elements: Flat element index of each active parameter.
+        parameter_rotates: Whether each active parameter is an angle.
+        joint_elements: Element index of each joint.
+        joint_rotates: Whether each joint is revolute.
+    """
+
+    parameter_elements: tuple[int, ...]
+    parameter_rotates: tuple[bool, ...]
+    joint_elements: tuple[int, ...]
+    joint_rotates: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Positions and derivatives of N configurations, structure of arrays: the last axis is N.
+
+    Attributes:
+        points: (targets, 3, N) target positions, base frame [m].
+        columns: (P, targets, 3, N) derivative by each parameter [m / unit].
+        joint_columns: (joints, targets, 3, N) derivative by each joint [m / rad or 1].
+        parameter_axes: (P, 3, N) axis of the element of each parameter, base frame.
+        joint_axes: (joints, 3, N) axis of each joint, base frame.
+        layout: Chain order of parameters and joints.
+    """
+
+    points: FloatArray
+    columns: FloatArray
+    joint_columns: FloatArray
+    parameter_axes: FloatArray
+    joint_axes: FloatArray
+    layout: Layout
+
+    def jacobian(self) -> FloatArray:
+        """Identification Jacobian (N, 3·targets, P), rows x, y, z target by target, contiguous."""
+        p, t, _, n = self.columns.shape
+        return np.ascontiguousarray(self.columns.reshape(p, 3 * t, n).transpose(2, 1, 0))
+
+    def jacobian_joint_derivatives(self) -> FloatArray:
+        """∂J/∂q, shape (N, 3·targets, P, joints) [m / unit / rad]; for tests and small problems."""
+        p, t, _, n = self.columns.shape
+        lay = self.layout
+        joints = len(lay.joint_elements)
+        out = np.zeros((p, joints, t, 3, n))
+        for a, (ea, ra) in enumerate(zip(lay.parameter_elements, lay.parameter_rotates, strict=True)):
+            for k, (ek, rk) in enumerate(zip(lay.joint_elements, lay.joint_rotates, strict=True)):
+                if ek <= ea and rk:
+                    out[a, k] = _cross(self.joint_axes[k], self.columns[a])
+                elif ea < ek and ra:
+                    out[a, k] = _cross(self.parameter_axes[a], self.joint_columns[k])
+        return out.reshape(p, joints, 3 * t, n).transpose(3, 2, 0, 1)
+
+    def pull_back(self, weights: FloatArray) -> FloatArray:
+        """Gradient in the joints of Σ weights · J.
+
+        Args:
+            weights: (P, targets, 3, N), ∂f/∂J.
+
+        Returns:
+            (N, joints), ∂f/∂q.
+        """
+        lay = self.layout
+        n = self.points.shape[-1]
+        order = sorted(range(len(lay.parameter_elements)), key=lambda a: lay.parameter_elements[a])
+        twist = np.zeros((3, n))
+        for a in order:
+            twist += _cross(self.columns[a], weights[a]).sum(axis=0)
+        front = np.zeros_like(self.points)
+        gradient = np.empty((len(lay.joint_elements), n))
+        queue = list(order)
+        for k in sorted(range(len(lay.joint_elements)), key=lambda j: lay.joint_elements[j]):
+            while queue and lay.parameter_elements[queue[0]] < lay.joint_elements[k]:
+                a = queue.pop(0)
+                twist -= _cross(self.columns[a], weights[a]).sum(axis=0)
+                if lay.parameter_rotates[a]:
+                    front += _cross(weights[a], self.parameter_axes[a])
+            gradient[k] = (self.joint_columns[k] * front).sum(axis=(0, 1))
+            if lay.joint_rotates[k]:
+                gradient[k] += (self.joint_axes[k] * twist).sum(axis=0)
+        return gradient.T
+
+
+def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Cross product over the axis before the last; broadcasts (3, N) against (targets, 3, N)."""
+    ux, uy, uz = u[..., 0, :], u[..., 1, :], u[..., 2, :]
+    vx, vy, vz = v[..., 0, :], v[..., 1, :], v[..., 2, :]
+    return np.stack((uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx), axis=-2)
