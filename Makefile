@@ -1,0 +1,23 @@
+# `make help` lists the targets. Everything that needs set-up does it first.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint clean
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+
+setup: ## make .venv and build the interfaces; seconds when nothing changed
+	@tools/setup.sh
+
+demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
+	@. ./env.sh && python -m calib_planner.ros.demo
+
+test: setup ## run every test (more options: make test PYTEST='-k plan')
+	@. ./env.sh && python -m pytest $(PYTEST)
+
+lint: setup ## ruff and mypy
+	@. ./env.sh && ruff check . && ruff format --check . && mypy
+
+clean: ## remove what was made: .venv, build, install, log, caches
+	rm -rf .venv build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

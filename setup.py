@@ -1,0 +1,51 @@
+"""Package of the library, its command line and its ROS 2 nodes (ament_python)."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "calib_planner"
+SHARE = f"share/{NAME}"
+
+
+def shared_tree(*folders):
+    """Pairs (target folder, files) that keep each folder's tree below share/calib_planner."""
+    files = [f for folder in folders for f in sorted(Path(folder).rglob("*")) if f.is_file()]
+    files = [f for f in files if "__pycache__" not in f.parts]
+    parents = sorted({f.parent for f in files})
+    return [(f"{SHARE}/{p.as_posix()}", [str(f) for f in files if f.parent == p]) for p in parents]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Plans robot calibration measurements and identifies geometrical parameters",
+    author="The calib_planner authors",
+    author_email="calib-planner@example.com",
+    maintainer="The calib_planner authors",
+    maintainer_email="calib-planner@example.com",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (SHARE, ["package.xml"]),
+        *shared_tree("config", "launch"),
+    ],
+    zip_safe=False,
+    install_requires=["numpy>=1.23", "scipy>=1.8", "PyYAML", "matplotlib>=3.5", "rich>=12"],
+    extras_require={
+        "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
+        "bags": ["rosbags"],
+        "distributed": ["dask[distributed]"],
+    },
+    entry_points={
+        "console_scripts": [
+            "calib-planner = calib_planner.cli:main",
+            "planner_node = calib_planner.ros.planner_node:main",
+            "identifier_node = calib_planner.ros.identifier_node:main",
+            "simulator_node = calib_planner.ros.simulator_node:main",
+        ],
+    },
+)
