@@ -11,7 +11,9 @@ LOG=$ROOT/log/setup.log
 say() { printf 'make setup: %s\n' "$*"; }
 die() { printf 'make setup: %s\n' "$*" >&2; exit 1; }
 hash_of() { cat "$@" 2>/dev/null | sha256sum | cut -c1-32; }
-hash_tree() { find "$@" -type f -not -path '*/__pycache__/*' 2>/dev/null | LC_ALL=C sort | xargs -r -d '\n' sha256sum | sha256sum | cut -c1-32; }
+files_in() { { find "$@" -type f -not -path '*/__pycache__/*' 2>/dev/null || true; } | LC_ALL=C sort; }
+hash_tree() { files_in "$@" | xargs -r -d '\n' sha256sum | hash_of -; }
+trap 'echo "make setup: tools/setup.sh failed at line $LINENO" >&2' ERR
 is_done() { [ "$(cat "$1" 2>/dev/null)" = "$2" ]; }
 
 run() { # run WHAT COMMAND...: quiet; the end of the log when it fails
@@ -113,6 +115,7 @@ if [ $ROS_FROM = wheels ]; then
   export AMENT_PREFIX_PATH="$VENV" CMAKE_PREFIX_PATH="$VENV"
   export ROS_VERSION=2 ROS_PYTHON_VERSION=3 ROS_DISTRO=jazzy
 fi
+# msg_defs is named because colcon does not look for packages below the root package.
 colcon_build() { colcon --log-base "$ROOT/log" build --base-paths . msg_defs --event-handlers console_direct- "$@"; }
 
 # ---- 2. interfaces --------------------------------------------------------------------------
@@ -126,7 +129,7 @@ fi
 
 # ---- 3. the package itself: editable in .venv, linked in install/ -----------------------------
 [ -f calib_planner/__init__.py ] || die "calib_planner/__init__.py is missing; this checkout is incomplete"
-package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml) $(find config launch -type f 2>/dev/null | LC_ALL=C sort | hash_of -) $packages_key"
+package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml) $(files_in config launch | hash_of -) $packages_key"
 if ! is_done "$ROOT/install/.stamp-package" "$package_key"; then
   say "installing calib_planner into .venv (editable)"
   run "installing calib_planner" "$VENV/bin/python" -m pip install --disable-pip-version-check \
