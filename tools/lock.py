@@ -2,8 +2,8 @@
 
 Run with Python 3.10's environment, whose versions also install on 3.11 and 3.12:
     .venv/bin/python tools/lock.py > requirements/constraints.txt
-The ROS wheels carry metadata of packages (rclpy, std_msgs, ...) that pip did not install; these have
-no INSTALLER file and are left out, as is the package itself.
+The ROS wheels carry metadata of packages (rclpy, std_msgs, ...) that pip did not install; these
+have no INSTALLER file and are left out, as is the package itself.
 """
 
 from importlib.metadata import distributions
