@@ -34,7 +34,11 @@ print("%d.%d.%d" % sys.version_info[:3], sysconfig.get_paths()["include"],
 
 find_python() {
   local candidate found
-  for candidate in ${PYTHON:+"$PYTHON"} python3 python3.12 python3.11 python3.10 \
+  if [ -n "${PYTHON:-}" ]; then
+    "$PYTHON" -c "$PROBE" 2>/dev/null || die "PYTHON=$PYTHON is not a Python 3.10, 3.11 or 3.12"
+    return
+  fi
+  for candidate in python3 python3.12 python3.11 python3.10 \
                    /usr/bin/python3 "${HOME:-}"/.pyenv/versions/3.1[0-2].*/bin/python3; do
     if found=$("$candidate" -c "$PROBE" 2>/dev/null); then
       echo "$found"
@@ -48,7 +52,7 @@ ros_is_sourced() { # ROS_DISTRO alone proves nothing
   [ -n "${AMENT_PREFIX_PATH:-}" ] && "$BASE_PYTHON" -c 'import rclpy' >/dev/null 2>&1
 }
 
-found=$(find_python)
+found=$(find_python) || exit 1
 IFS='|' read -r PY_VERSION PY_INCLUDE BASE_PYTHON <<<"$found"
 PY_XY=${PY_VERSION%.*}
 command -v "${CXX:-g++}" >/dev/null || die "no C++ compiler found; install it with: sudo apt install g++"
