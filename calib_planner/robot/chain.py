@@ -129,8 +129,15 @@ class Robot:
         return replace(self, elements=head + self.elements[9:])
 
     def with_targets(self, xyz: ArrayLike) -> Robot:
-        """The robot with targets at ``xyz``, shape (targets, 3), in the tip's frame [m]."""
-        return replace(self, targets=target_elements(check_array("targets", xyz, (None, 3))))
+        """The robot with targets at ``xyz``, shape (targets, 3), in the tip's frame [m].
+
+        Parameters of targets that are no longer there are no longer active.
+        """
+        branches = target_elements(check_array("targets", xyz, (None, 3)))
+        gone = {e.parameter for b in self.targets for e in b}
+        gone -= {e.parameter for b in branches for e in b}
+        names = tuple(n for n in self.parameter_names if n not in gone)
+        return replace(self, targets=branches, parameter_names=names)
 
     # ── what it is ───────────────────────────────────────────────────────────────────────────────────
 

@@ -1,0 +1,103 @@
+"""The answer of the planner: configurations, what they promise, and how far from the best possible that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray, IntArray, frozen
+
+STATUS = {
+    "ok": "The plan is complete.",
+    "singular": "The plan predicts the test poses but leaves parameter combinations unseen: raise the number "
+    "of configurations, the general weight or add test poses.",
+    "time_limit": "The time limit ended the search; this is the best plan found so far.",
+    "cancelled": "The search was cancelled; this is the best plan found so far.",
+}
+"""Every status a plan can have, with advice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A measurement plan that carries its own proof.
+
+    Attributes:
+        robot: Name of the robot.
+        criterion: What was minimised.
+        parameters: Names of the parameters to be identified.
+        joint_names: Order of the columns of ``configurations`` and ``test_poses``.
+        configurations: (m, joints) in the order of measuring [rad | m].
+        repetitions: (m,) measurements at each.
+        test_poses: (K, joints) [rad | m].
+        weights: (K,) weights of the test poses.
+        sigma: Standard deviation of one coordinate [m].
+        predicted_accuracy: ρ0 of eq. (14), root mean square over the test poses [m].
+        predicted_accuracy_per_test_pose: (K,) [m].
+        parameter_std: (P,) predicted standard deviation of each parameter, infinite if unseen [m | rad].
+        general_accuracy: Root mean square error over random configurations within the limits [m].
+        lower_bound: No plan with as many measurements has a smaller ρ0 [m].
+        efficiency: lower_bound / predicted_accuracy, at most 1.
+        bound: ``"numerical"`` (the sensitivity was maximised by search) or ``"proven"``.
+        status: A key of ``STATUS``.
+        message: What it means and what to do.
+        seconds: Time spent.
+        seed: The seed that reproduces it.
+        starts: Starts done.
+        evaluations: Plans evaluated.
+    """
+
+    robot: str
+    criterion: str
+    parameters: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    configurations: FloatArray
+    repetitions: IntArray
+    test_poses: FloatArray
+    weights: FloatArray
+    sigma: float
+    predicted_accuracy: float
+    predicted_accuracy_per_test_pose: FloatArray
+    parameter_std: FloatArray
+    general_accuracy: float
+    lower_bound: float
+    efficiency: float
+    bound: str
+    status: str
+    message: str
+    seconds: float
+    seed: int
+    starts: int
+    evaluations: int
+
+    def __post_init__(self) -> None:
+        for name in ("configurations", "test_poses", "weights", "parameter_std"):
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), float)))
+        per = frozen(np.asarray(self.predicted_accuracy_per_test_pose, float))
+        object.__setattr__(self, "predicted_accuracy_per_test_pose", per)
+        object.__setattr__(self, "repetitions", frozen(np.asarray(self.repetitions, np.int64)))
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements in all."""
+        return int(self.repetitions.sum())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
+        return plain({name: getattr(self, name) for name in self.__dataclass_fields__})
+
+
+def plain(value: Any) -> Any:
+    """Arrays to lists, NumPy numbers to Python's, non-finite numbers to ``None``, recursively."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,113 @@
+"""Where the tracker stands and where the targets sit, in closed form: no initial guess.
+
+With the tip at rotation R_i and position o_i in the base frame, a target at t in the tip's frame is seen at
+
+    p_i = R_b (R_i t + o_i) + t_b.
+
+Multiplying by C = R_bᵀ and writing d = R_bᵀ t_b makes it linear in everything unknown:
+
+    C p_i − d − R_i t = o_i.
+
+Least squares gives C, which is projected onto the rotations (Kabsch); with R_b fixed, t_b and t are linear
+again and solved anew. Unknown target offsets need the base; with known offsets the same equations hold with
+t on the right-hand side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray
+from calib_planner.errors import NotEnoughDataError
+from calib_planner.identification.measurements import Measurements
+from calib_planner.robot.chain import Robot
+
+
+def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Robot:
+    """``robot`` with the base pose and target offsets that fit the nominal kinematics best.
+
+    Args:
+        base: The tracker's pose is unknown; otherwise the robot's base pose is kept.
+        tool: The target offsets are unknown; otherwise the robot's targets are kept.
+
+    Raises:
+        NotEnoughDataError: Fewer equations than unknowns, or all configurations alike.
+    """
+    if not (base or tool):
+        return robot
+    rotations, origins = _tip_poses(robot, data.q, at_base=base)
+    row, target = np.nonzero(data.seen)
+    p, r, o = data.p[row, target], rotations[row], origins[row]
+    offsets = robot.target_offsets
+    matrix, xyz = (np.eye(3), np.zeros(3)) if base else robot.base_pose
+    if base:
+        matrix = _base_rotation(p, r, o, target, None if tool else offsets)
+    targets = len(robot.targets)
+    # p − R_b o = t_b + R_b R_i t, linear in t_b and t once R_b is known.
+    columns = [np.broadcast_to(np.eye(3), r.shape)] if base else []
+    lever = matrix @ r if base else r
+    if tool:
+        blocks = np.zeros((len(row), 3, targets, 3))
+        blocks[np.arange(len(row)), :, target] = lever
+        columns.append(blocks.reshape(len(row), 3, 3 * targets))
+    right = p - (o @ matrix.T if base else o)
+    if not tool:
+        right = right - np.einsum("nij,nj->ni", lever, offsets[target])
+    system = np.concatenate(columns, axis=2)
+    solution = _solve(system.reshape(3 * len(row), -1), right.ravel())
+    if base:
+        xyz, solution = solution[:3], solution[3:]
+        robot = robot.with_base(matrix, xyz)
+    return robot.with_targets(solution.reshape(targets, 3)) if tool else robot
+
+
+def _base_rotation(
+    p: FloatArray, r: FloatArray, o: FloatArray, target: FloatArray, offsets: FloatArray | None
+) -> FloatArray:
+    n = len(p)
+    blocks = np.zeros((n, 3, 3, 3))
+    for axis in range(3):
+        blocks[:, axis, axis, :] = p
+    columns = [blocks.reshape(n, 3, 9), np.broadcast_to(-np.eye(3), (n, 3, 3))]
+    right = o
+    if offsets is None:
+        lever = np.zeros((n, 3, int(target.max()) + 1, 3))
+        lever[np.arange(n), :, target] = -r
+        columns.append(lever.reshape(n, 3, -1))
+    else:
+        right = o + np.einsum("nij,nj->ni", r, offsets[target])
+    system = np.concatenate(columns, axis=2).reshape(3 * n, -1)
+    # Points in one plane leave C short of a column or row; the projection restores it.
+    solution = np.linalg.lstsq(system, right.ravel(), rcond=1e-10)[0]
+    u, values, vt = np.linalg.svd(solution[:9].reshape(3, 3))
+    if values[1] < 1e-3:
+        raise NotEnoughDataError(
+            3 * n,
+            system.shape[1],
+            "the measured configurations do not determine the tracker's pose: "
+            "measure at least 4 configurations that differ in several joints",
+        )
+    sign = np.sign(np.linalg.det(u @ vt))
+    return (u @ np.diag([1.0, 1.0, sign]) @ vt).T
+
+
+def _solve(system: FloatArray, right: FloatArray) -> FloatArray:
+    if system.shape[0] < system.shape[1]:
+        raise NotEnoughDataError(
+            system.shape[0],
+            system.shape[1],
+            f"{system.shape[0]} equations for {system.shape[1]} unknowns of tracker and target pose: "
+            "measure more configurations",
+        )
+    return np.linalg.lstsq(system, right, rcond=1e-10)[0]
+
+
+def _tip_poses(robot: Robot, q: FloatArray, *, at_base: bool) -> tuple[FloatArray, FloatArray]:
+    """Rotation (N, 3, 3) and origin (N, 3) of the tip, from four points fixed to it."""
+    if at_base:
+        robot = robot.with_base(np.eye(3), np.zeros(3))
+    frame = np.vstack([np.zeros(3), np.eye(3)])
+    points = replace(robot, parameter_names=()).with_targets(frame).positions(q)
+    return (points[:, 1:] - points[:, :1]).transpose(0, 2, 1), points[:, 0]

@@ -1,0 +1,74 @@
+"""Does the calibrated robot predict poses that took no part in the fit?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray
+from calib_planner.errors import InputError, NotEnoughDataError
+from calib_planner.identification.estimate import Estimate, Validation
+from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.problem import IdentificationProblem
+from calib_planner.identification.registration import register
+from calib_planner.identification.solver import distances, fit_placement, start_robot
+from calib_planner.robot.chain import Robot
+
+
+def validate(
+    problem: IdentificationProblem,
+    estimate: Estimate,
+    held_out: Sequence[Measurements],
+    target_from: int = 0,
+) -> Estimate:
+    """``estimate`` with the distances on held-out data.
+
+    Args:
+        held_out: One or more sets; the statistics are over all their points.
+        target_from: The target was re-seated for each set: the first ``target_from`` rows of each give its
+            offset, all else being kept, and only the other rows are the test. 0: target 1 … as identified.
+
+    Raises:
+        NotEnoughDataError: A set has no rows left to test.
+    """
+    if target_from < 0:
+        raise InputError("validate_target_from", target_from, "a whole number >= 0")
+    before_robot = _before(problem)
+    after, before = [], []
+    for data in (d.in_order_of(problem.robot.joint_names) for d in held_out):
+        if len(data) <= target_from:
+            raise NotEnoughDataError(
+                len(data), target_from + 1, f"{len(data)} validation rows, the first {target_from} of "
+                "which give the target: nothing is left to test"
+            )
+        first, rest = np.arange(target_from), np.arange(target_from, len(data))
+        for robot, out in ((estimate.calibrated, after), (before_robot, before)):
+            out.append(_distances(robot, data.select(first) if target_from else None, data.select(rest)))
+    after_all, before_all = np.concatenate(after), np.concatenate(before)
+    return estimate.with_validation(
+        Validation(
+            count=len(after_all),
+            mean=float(after_all.mean()),
+            median=float(np.median(after_all)),
+            rms=float(np.sqrt(np.mean(after_all**2))),
+            max=float(after_all.max()),
+            before_mean=float(before_all.mean()),
+        )
+    )
+
+
+def _before(problem: IdentificationProblem) -> Robot:
+    """Nominal kinematics, with base and targets fitted to the calibration data where they are unknown."""
+    return fit_placement(start_robot(problem.robot, problem.data), problem.data)
+
+
+def _distances(robot: Robot, seat: Measurements | None, data: Measurements) -> FloatArray:
+    targets = data.p.shape[1]
+    if seat is not None:
+        robot = register(robot.with_targets(np.zeros((targets, 3))), seat, base=False, tool=True)
+    elif len(robot.targets) < targets:
+        raise InputError("validation data", f"{targets} targets", f"at most {len(robot.targets)} targets")
+    else:
+        robot = robot.with_targets(robot.target_offsets[:targets])
+    return distances(data.p - robot.positions(data.q))
