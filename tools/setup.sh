@@ -38,7 +38,7 @@ find_python() {
     "$PYTHON" -c "$PROBE" 2>/dev/null || die "PYTHON=$PYTHON is not a Python 3.10, 3.11 or 3.12"
     return
   fi
-  for candidate in python3 python3.12 python3.11 python3.10 \
+  for candidate in "$VENV/bin/python" python3 python3.12 python3.11 python3.10 \
                    /usr/bin/python3 "${HOME:-}"/.pyenv/versions/3.1[0-2].*/bin/python3; do
     if found=$("$candidate" -c "$PROBE" 2>/dev/null); then
       echo "$found"
