@@ -30,7 +30,7 @@ run() { # run WHAT COMMAND...: quiet; the end of the log when it fails
 PROBE='import os, sys, sysconfig
 assert (3, 10) <= sys.version_info[:2] <= (3, 12)
 print("%d.%d.%d" % sys.version_info[:3], sysconfig.get_paths()["include"],
-      getattr(sys, "_base_executable", sys.executable), sep="|")'
+      os.path.realpath(getattr(sys, "_base_executable", sys.executable)), sep="|")'
 
 find_python() {
   local candidate found
