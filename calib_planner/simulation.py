@@ -52,9 +52,7 @@ class SimulatedCell:
 
     truth: Robot = None  # type: ignore[assignment]
 
-    def measure(
-        self, configurations: ArrayLike, repetitions: ArrayLike | int, seed: int
-    ) -> Measurements:
+    def measure(self, configurations: ArrayLike, repetitions: ArrayLike | int, seed: int) -> Measurements:
         """Measure each configuration ``repetitions`` times; one row per measurement."""
         q = check_configurations("configurations", configurations, self.nominal.joint_names)
         if np.ndim(repetitions) == 0:

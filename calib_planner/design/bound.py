@@ -27,6 +27,12 @@ from calib_planner.design.search.descent import descend
 from calib_planner.robot.chain import Robot
 
 
+SPREAD = 256
+FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
+"""Weight of a spread of random configurations in every measure. The optimum is often singular; the floor keeps
+M invertible and d smooth, and costs the bound less than its weight times the price of a random plan."""
+
+
 @dataclass(frozen=True)
 class RelaxedDesign:
     """The relaxed optimum, as far as found.
@@ -52,7 +58,7 @@ def relaxed_design(
     stop: Callable[[], bool] = lambda: False,
     *,
     rounds: int = 60,
-    gap: float = 2e-3,
+    gap: float = 3e-3,
 ) -> RelaxedDesign:
     """Solve the relaxed problem by growing a discrete measure.
 
@@ -62,20 +68,15 @@ def relaxed_design(
         gap: Ends when bound ≥ (1 − gap)·value.
     """
     low, high = robot.joint_limits.T
-    spread = rng.uniform(low, high, (128, len(low)))
-    support = np.concatenate([start, spread])
-    weights = np.concatenate(
-        [np.full(len(start), 0.9 / max(len(start), 1)), np.full(len(spread), 0.1 / len(spread))]
-    )
-    weights /= weights.sum()
+    everywhere = _unit_information(robot, rng.uniform(low, high, (SPREAD, len(low)))).mean(axis=0)
+    support, weights = start, np.full(len(start), 1.0 / len(start))
     best_value, best_bound, best = np.inf, 0.0, (support, weights)
-    for _ in range(rounds):
+    for step in range(rounds):
+        floor = max(FIRST_FLOOR * 0.7**step, LAST_FLOOR)
         unit = _unit_information(robot, support)
-        weights, value, slope = _multiplicative(unit, weight, weights, 60)
-        probes = np.concatenate(
-            [support[np.argsort(-weights)[:12]], rng.uniform(low, high, (24, len(low)))]
-        )
-        peaks = descend(_sensitivity(robot, slope), probes, low, high, iterations=60, tolerance=1e-4)
+        weights, value, slope = _multiplicative(unit, weight, weights, floor * everywhere, floor)
+        probes = _probes(robot, slope, support[np.argsort(-weights)[:10]], rng)
+        peaks = descend(_sensitivity(robot, slope), probes, low, high, iterations=40, tolerance=1e-4)
         largest = float(np.exp(-peaks.value.min()))
         if value < best_value:
             best_value, best = value, (support, weights)
@@ -83,11 +84,21 @@ def relaxed_design(
         if best_bound >= (1.0 - gap) * best_value or stop():
             break
         new = peaks.x[np.argsort(peaks.value)[:6]]
-        keep = (weights > 1e-5) | (np.arange(len(weights)) < 64)
+        keep = weights > 1e-6
+        share = 0.02 if floor > LAST_FLOOR else 0.005
         support = np.concatenate([support[keep], new])
-        weights = np.concatenate([0.95 * weights[keep], np.full(len(new), 0.05 / len(new))])
+        weights = np.concatenate([weights[keep], np.full(len(new), share / len(new))])
         weights /= weights.sum()
     return RelaxedDesign(best_value, best_bound, *best)
+
+
+def _probes(robot: Robot, slope: FloatArray, known: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Starts for the maximisation of d: the support, and the best of many random configurations."""
+    low, high = robot.joint_limits.T
+    random = rng.uniform(low, high, (512, len(low)))
+    jacobian = robot.jacobian(random)
+    height = np.einsum("nij,jk,nik->n", jacobian, slope, jacobian, optimize=True)
+    return np.concatenate([known, random[np.argsort(-height)[:14]]])
 
 
 def _unit_information(robot: Robot, q: FloatArray) -> FloatArray:
@@ -97,14 +108,18 @@ def _unit_information(robot: Robot, q: FloatArray) -> FloatArray:
 
 
 def _multiplicative(
-    unit: FloatArray, weight: FloatArray, w: FloatArray, iterations: int
+    unit: FloatArray,
+    weight: FloatArray,
+    w: FloatArray,
+    ground: FloatArray,
+    floor: float,
+    iterations: int = 100,
 ) -> tuple[FloatArray, float, FloatArray]:
     """Improve the weights; returns them, φ, and B = M⁻¹AM⁻¹ (so that d(q) = trace(J B Jᵀ))."""
     flat = unit.reshape(len(unit), -1)
     size = unit.shape[1]
     for step in range(iterations + 1):
-        matrix = (w @ flat).reshape(size, size)
-        inverse = np.linalg.inv(matrix + 1e-13 * np.trace(matrix) / size * np.eye(size))
+        inverse = np.linalg.inv((1.0 - floor) * (w @ flat).reshape(size, size) + ground)
         half = inverse @ weight
         slope, value = half @ inverse, float(np.trace(half))
         if step < iterations:

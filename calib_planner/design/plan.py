@@ -1,4 +1,4 @@
-"""The answer of the planner: configurations, what they promise, and how far from the best possible that is."""
+"""The answer of the planner: configurations, what they promise, how far from the best possible that is."""
 
 from __future__ import annotations
 

@@ -64,9 +64,7 @@ def plan(problem: PlanProblem, callback: Callable[[Progress], bool | None] | Non
 class _Clock:
     """Time limit, cancellation and progress in one place."""
 
-    def __init__(
-        self, problem: PlanProblem, callback: Callable[[Progress], bool | None] | None
-    ) -> None:
+    def __init__(self, problem: PlanProblem, callback: Callable[[Progress], bool | None] | None) -> None:
         self.began = time.perf_counter()
         self.deadline = self.began + problem.time_limit
         self.callback = callback
@@ -179,7 +177,11 @@ def visiting_order(configurations: FloatArray, robot: Robot) -> FloatArray:
         improved = False
         for i in range(1, len(tour) - 1):
             for j in range(i + 1, len(tour)):
-                tail = distance[tour[i], tour[j + 1]] - distance[tour[j], tour[j + 1]] if j + 1 < len(tour) else 0
+                tail = (
+                    distance[tour[i], tour[j + 1]] - distance[tour[j], tour[j + 1]]
+                    if j + 1 < len(tour)
+                    else 0
+                )
                 gain = distance[tour[i - 1], tour[j]] - distance[tour[i - 1], tour[i]] + tail
                 if gain < -1e-12:
                     tour[i : j + 1] = tour[i : j + 1][::-1]

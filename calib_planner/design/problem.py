@@ -58,7 +58,11 @@ class PlanProblem:
             raise InputError("robot", type(robot).__name__, "a Robot", "use Robot.load(...)")
         if self.criterion not in CRITERIA:
             raise UnknownNameError("criterion", str(self.criterion), CRITERIA)
-        put(self, "test_poses", check_configurations("test_poses", self.test_poses, robot.joint_names))
+        put(
+            self,
+            "test_poses",
+            check_configurations("test_poses", self.test_poses, robot.joint_names),
+        )
         _check_within_limits(robot, self.test_pose_array)
         put(self, "configurations", check_count("configurations", self.configurations, high=10_000))
         put(self, "repetitions", check_count("repetitions", self.repetitions, high=100_000))
@@ -67,8 +71,16 @@ class PlanProblem:
         if (weights < 0).any() or not weights.any():
             raise InputError("weights", weights.tolist(), "numbers >= 0, not all zero")
         put(self, "weights", weights)
-        put(self, "sigma", check_number("sigma", self.sigma, low=0, low_open=True, high=1.0, unit="m"))
-        put(self, "general_weight", check_number("general_weight", self.general_weight, low=0, high=1))
+        put(
+            self,
+            "sigma",
+            check_number("sigma", self.sigma, low=0, low_open=True, high=1.0, unit="m"),
+        )
+        put(
+            self,
+            "general_weight",
+            check_number("general_weight", self.general_weight, low=0, high=1),
+        )
         put(self, "starts", check_count("starts", self.starts, high=100_000))
         put(self, "seed", check_count("seed", self.seed, low=0, high=2**63 - 1))
         if not self.time_limit > 0:
@@ -101,7 +113,8 @@ def _check_within_limits(robot: Robot, poses: FloatArray) -> None:
 
 def _check_enough(robot: Robot, configurations: int) -> None:
     """Refuse what no choice of configurations can identify."""
-    sample = np.random.default_rng(0).uniform(*robot.joint_limits.T, (64, len(robot.joint_names)))
+    low, high = robot.joint_limits.T
+    sample = np.random.default_rng(0).uniform(low, high, (64, len(low)))
     jacobian = robot.jacobian(sample)
     names = robot.parameter_names
     norms = np.linalg.norm(jacobian.reshape(-1, len(names)), axis=0)

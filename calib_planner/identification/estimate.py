@@ -141,7 +141,13 @@ class Estimate:
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
         columns = zip(
-            self.parameters, self.units, self.nominal, self.values, self.deviations, self.std, strict=True
+            self.parameters,
+            self.units,
+            self.nominal,
+            self.values,
+            self.deviations,
+            self.std,
+            strict=True,
         )
         keys = ("name", "unit", "nominal", "value", "deviation", "std")
         result = {

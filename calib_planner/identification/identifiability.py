@@ -71,9 +71,7 @@ def analyse(jacobian: FloatArray, names: Sequence[str], tolerance: float = TOLER
     return Identifiability(tuple(kept), tuple(combinations), tuple(held))
 
 
-def _describe(
-    unit: FloatArray, scale: FloatArray, names: Sequence[str], kept: list[int], i: int
-) -> str:
+def _describe(unit: FloatArray, scale: FloatArray, names: Sequence[str], kept: list[int], i: int) -> str:
     """The null combination: parameter i against those that imitate it."""
     if scale[i] == 0.0:
         return names[i]

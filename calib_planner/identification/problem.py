@@ -19,8 +19,8 @@ LOSSES = ("linear",)
 class IdentificationProblem:
     """Find the active parameters of ``robot`` from ``data``.
 
-    Where the base (all six ``base.*``) or the targets (all ``target_*``) are among the active parameters, they
-    start from a closed form (see ``registration``), whatever the robot's own values are.
+    Where the base (all six ``base.*``) or the targets (all ``target_*``) are among the active parameters,
+    they start from a closed form (see ``registration``), whatever the robot's own values are.
 
     Attributes:
         robot: The nominal robot, its active parameters being those to be identified.

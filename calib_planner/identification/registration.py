@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.measurements import Measurements
 from calib_planner.robot.chain import Robot
@@ -64,7 +64,7 @@ def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Rob
 
 
 def _base_rotation(
-    p: FloatArray, r: FloatArray, o: FloatArray, target: FloatArray, offsets: FloatArray | None
+    p: FloatArray, r: FloatArray, o: FloatArray, target: IntArray, offsets: FloatArray | None
 ) -> FloatArray:
     n = len(p)
     blocks = np.zeros((n, 3, 3, 3))
@@ -101,7 +101,7 @@ def _solve(system: FloatArray, right: FloatArray) -> FloatArray:
             f"{system.shape[0]} equations for {system.shape[1]} unknowns of tracker and target pose: "
             "measure more configurations",
         )
-    return np.linalg.lstsq(system, right, rcond=1e-10)[0]
+    return np.asarray(np.linalg.lstsq(system, right, rcond=1e-10)[0], np.float64)
 
 
 def _tip_poses(robot: Robot, q: FloatArray, *, at_base: bool) -> tuple[FloatArray, FloatArray]:

@@ -2,7 +2,7 @@
 
 Linearise at the current parameters, eq. (3); solve min ‖J ΔΠ − Δp‖² for the whitened, column-scaled Jacobian
 of an irreducible set of parameters (see ``identifiability``); add ΔΠ; repeat. A step that does not lower the
-sum of squares is damped (Levenberg–Marquardt), so the plain iteration is what happens when nothing goes wrong.
+sum of squares is damped (Levenberg–Marquardt): the plain iteration is what happens when nothing goes wrong.
 Afterwards cov(Π̂) = σ² (JᵀJ)⁻¹, eq. (11), with σ given, or estimated from the residuals.
 """
 
@@ -54,9 +54,7 @@ def start_robot(robot: Robot, data: Measurements) -> Robot:
     """``robot`` with its unknown base and targets, if any, at their closed-form values for these data."""
     active = robot.parameter_names
     base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
-    tool = all(
-        f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz"
-    )
+    tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
     return register(robot, data, base=base, tool=tool)
 
 
@@ -103,7 +101,8 @@ def _iterate(system: _System, deviations: FloatArray, most: int) -> _Fit:
     residuals, jacobian = system.linearise(deviations)
     found = analyse(jacobian, system.robot.parameter_names)
     kept = list(found.kept)
-    damping, done, converged = 0.0, 0, not kept
+    damping, done = 0.0, 0
+    converged = not kept
     while kept and done < most and not converged:
         done += 1
         scale = np.linalg.norm(jacobian[:, kept], axis=0)
@@ -115,10 +114,10 @@ def _iterate(system: _System, deviations: FloatArray, most: int) -> _Fit:
             step = np.linalg.lstsq(unit, residuals, rcond=None)[0]
         trial = deviations.copy()
         trial[kept] += step / scale
-        cost, new_cost = residuals @ residuals, np.inf
+        cost, new_cost = float(residuals @ residuals), np.inf
         if np.isfinite(trial).all():
             new = system.residuals(trial)
-            new_cost = new @ new
+            new_cost = float(new @ new)
         size = np.linalg.norm(unit @ step)
         floor = STEP_TOLERANCE * (1.0 + np.linalg.norm(residuals))
         if new_cost <= cost or size <= floor:

@@ -28,9 +28,7 @@ def shipped_robots() -> Sequence[str]:
     return sorted(p.stem for p in (config_folder() / "robots").glob("*.yaml"))
 
 
-def load_robot(
-    source: str | Path, *, base_link: str | None = None, tip_link: str | None = None
-) -> Robot:
+def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
     """See ``Robot.load``."""
     if str(source) in shipped_robots():
         return read_robot_yaml(config_folder() / "robots" / f"{source}.yaml")

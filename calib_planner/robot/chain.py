@@ -74,9 +74,7 @@ class Robot:
     # ── making ───────────────────────────────────────────────────────────────────────────────────────
 
     @staticmethod
-    def load(
-        source: str | Path, *, base_link: str | None = None, tip_link: str | None = None
-    ) -> Robot:
+    def load(source: str | Path, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
         """Load a shipped robot by name, or a robot YAML or URDF by path.
 
         Raises:
@@ -87,9 +85,7 @@ class Robot:
 
         return load_robot(source, base_link=base_link, tip_link=tip_link)
 
-    def with_parameters(
-        self, request: str | Sequence[str], unknown: Iterable[str] = ()
-    ) -> Robot:
+    def with_parameters(self, request: str | Sequence[str], unknown: Iterable[str] = ()) -> Robot:
         """The same robot with other active parameters; see ``parameters.resolve_parameters``."""
         names = resolve_parameters(
             request, unknown, self.available_parameters, self.levels, len(self.targets)
@@ -114,7 +110,7 @@ class Robot:
         )
 
     def with_base(self, rotation_matrix: ArrayLike, xyz: ArrayLike) -> Robot:
-        """The robot placed at ``xyz`` [m] with axes ``rotation_matrix`` (3, 3), e.g. in the tracker's frame."""
+        """The robot placed at ``xyz`` [m] with axes ``rotation_matrix`` (3, 3), e.g. in a tracker's frame."""
         matrix = check_array("rotation_matrix", rotation_matrix, (3, 3))
         offset = check_array("xyz", xyz, (3,))
         yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
@@ -123,9 +119,7 @@ class Robot:
         rest = rotation(1, pitch).T @ rotation(2, yaw).T @ matrix
         roll = np.arctan2(rest[2, 1], rest[1, 1])
         values = [*offset, yaw, pitch, roll, 0.0, 0.0, 0.0]
-        head = tuple(
-            replace(e, value=float(v)) for e, v in zip(self.elements[:9], values, strict=True)
-        )
+        head = tuple(replace(e, value=float(v)) for e, v in zip(self.elements[:9], values, strict=True))
         return replace(self, elements=head + self.elements[9:])
 
     def with_targets(self, xyz: ArrayLike) -> Robot:
@@ -175,6 +169,11 @@ class Robot:
     def target_offsets(self) -> FloatArray:
         """(targets, 3) target positions in the tip's frame [m]."""
         return np.array([[e.value for e in branch] for branch in self.targets])
+
+    @property
+    def joint_is_revolute(self) -> NDArray[np.bool_]:
+        """(joints,) whether each joint turns; the others slide."""
+        return np.array(self._layout.joint_rotates)
 
     # ── where things are ─────────────────────────────────────────────────────────────────────────────
 
@@ -284,8 +283,7 @@ def target_elements(xyz: FloatArray) -> tuple[tuple[Element, ...], ...]:
     """Branches from the tip to targets at ``xyz`` (targets, 3) [m], with parameters target_k.x, .y, .z."""
     return tuple(
         tuple(
-            Element("T" + a, float(v), parameter=f"target_{t}.{a}")
-            for a, v in zip("xyz", row, strict=True)
+            Element("T" + a, float(v), parameter=f"target_{t}.{a}") for a, v in zip("xyz", row, strict=True)
         )
         for t, row in enumerate(xyz, start=1)
     )

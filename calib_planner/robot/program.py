@@ -64,9 +64,7 @@ def structure_of(
 ) -> Structure:
     """Classify each constant amount (flat order) and describe the chain."""
     elements = [*trunk, *(e for branch in branches for e in branch)]
-    coded = [
-        (e.kind, e.joint, e.sign, _code(e, amount)) for e, amount in zip(elements, amounts, strict=True)
-    ]
+    coded = [(e.kind, e.joint, e.sign, _code(e, amount)) for e, amount in zip(elements, amounts, strict=True)]
     split, start = [], len(trunk)
     for branch in branches:
         split.append(tuple(coded[start : start + len(branch)]))
@@ -78,9 +76,9 @@ def _code(element: Element, amount: complex) -> int:
     if amount == 0:
         return 0
     if element.is_rotation and element.joint is None and np.isrealobj(amount):
-        turns = amount / (np.pi / 2)
+        turns = float(np.real(amount)) / (np.pi / 2)
         if abs(turns - round(turns)) < 1e-15:
-            return int(round(turns)) % 4
+            return round(turns) % 4
     return GENERAL
 
 
@@ -133,9 +131,7 @@ class _Tracer:
         return self.add(x, (-y[0], y[1]))
 
     def cross(self, u: Sequence[Ref], v: Sequence[Ref]) -> list[Ref]:
-        return [
-            self.sub(self.mul(u[i], v[j]), self.mul(u[j], v[i])) for i, j in ((1, 2), (2, 0), (0, 1))
-        ]
+        return [self.sub(self.mul(u[i], v[j]), self.mul(u[j], v[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 @dataclass
@@ -180,12 +176,8 @@ def _walk(
         sin = (sin[0] * int(sign), sin[1])
         u, v = frame.axes[(a + 1) % 3], frame.axes[(a + 2) % 3]
         mul, add, sub = tracer.mul, tracer.add, tracer.sub
-        frame.axes[(a + 1) % 3] = [
-            add(mul(cos, x), mul(sin, y)) for x, y in zip(u, v, strict=True)
-        ]
-        frame.axes[(a + 2) % 3] = [
-            sub(mul(cos, y), mul(sin, x)) for x, y in zip(u, v, strict=True)
-        ]
+        frame.axes[(a + 1) % 3] = [add(mul(cos, x), mul(sin, y)) for x, y in zip(u, v, strict=True)]
+        frame.axes[(a + 2) % 3] = [sub(mul(cos, y), mul(sin, x)) for x, y in zip(u, v, strict=True)]
     return seen
 
 
@@ -342,7 +334,9 @@ def _lay_out(tracer: _Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -
     for _, node in outputs:
         last_use[node] = len(order)
     slots = rows
-    joints, constants, registers = [], [], []
+    joints: list[tuple[int, int]] = []
+    constants: list[tuple[int, int]] = []
+    registers: list[tuple[int, int]] = []
     free: list[int] = []
     used = 0
     for node in needed:

@@ -144,9 +144,7 @@ class _Reader:
             )
         for key in item:
             if key not in keys:
-                raise FileFormatError(
-                    self.path, where, f"unknown key {key!r}", f"only: {', '.join(keys)}"
-                )
+                raise FileFormatError(self.path, where, f"unknown key {key!r}", f"only: {', '.join(keys)}")
         for key in required:
             if key not in item:
                 raise FileFormatError(self.path, where, f"no key {key!r}", f"{key!r} to be given")

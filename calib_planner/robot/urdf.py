@@ -49,9 +49,7 @@ def read_urdf(path: Path, base_link: str | None = None, tip_link: str | None = N
     return parse_urdf(text, str(path), base_link, tip_link)
 
 
-def parse_urdf(
-    text: str, source: str, base_link: str | None = None, tip_link: str | None = None
-) -> Robot:
+def parse_urdf(text: str, source: str, base_link: str | None = None, tip_link: str | None = None) -> Robot:
     """Like ``read_urdf``, from the text itself; ``source`` names it in errors.
 
     Raises:
@@ -99,9 +97,7 @@ def _joint(source: str, item: ElementTree.Element) -> UrdfJoint:
     )
 
 
-def _limits(
-    source: str, where: str, kind: str, limit: ElementTree.Element | None
-) -> tuple[float, float]:
+def _limits(source: str, where: str, kind: str, limit: ElementTree.Element | None) -> tuple[float, float]:
     if kind == "continuous":
         return -np.pi, np.pi
     if limit is None or kind not in MOVING:
@@ -145,7 +141,11 @@ def _chain(
         leaves = [link for link in links if link not in parents and link in by_child]
         if len(leaves) != 1:
             raise FileFormatError(
-                source, "tip link", f"{len(leaves)} possible tips: {', '.join(leaves)}", "one", "name it"
+                source,
+                "tip link",
+                f"{len(leaves)} possible tips: {', '.join(leaves)}",
+                "one",
+                "name it",
             )
         tip_link = leaves[0]
     chain: list[UrdfJoint] = []

@@ -12,8 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 
 Objective = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Maps X (rows, D) to values (rows,) and gradients (rows, D)."""
@@ -140,7 +141,7 @@ def _line_search(
 
 
 def _update(
-    inverse: FloatArray, fresh: FloatArray, rows: FloatArray, s: FloatArray, y: FloatArray
+    inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray
 ) -> None:
     """BFGS update of the inverse Hessians of ``rows``, scaled at first use, skipped where s·y ≤ 0."""
     sy = (s * y).sum(axis=1)

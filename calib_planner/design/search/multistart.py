@@ -114,9 +114,7 @@ def _descend_from(robot, criterion, size, rows, stop, iterations):  # type: igno
     )
 
 
-def _random(
-    rng: np.random.Generator, low: FloatArray, high: FloatArray, count: int, size: int
-) -> FloatArray:
+def _random(rng: np.random.Generator, low: FloatArray, high: FloatArray, count: int, size: int) -> FloatArray:
     return rng.uniform(low, high, (count, size, len(low)))
 
 
