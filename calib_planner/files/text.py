@@ -1,0 +1,86 @@
+"""Text in and out of files: bounded reading, atomic writing, typed errors."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from calib_planner.errors import FileFormatError, InputError
+
+MAX_BYTES = 50_000_000
+"""Larger files are refused: a plan or a day's measurements is far below a megabyte."""
+
+
+def read_text(path: str | Path, what: str) -> str:
+    """The text of a UTF-8 file, without a byte order mark.
+
+    Args:
+        path: The file.
+        what: What it should be, for the error, e.g. ``"a CSV of measurements"``.
+
+    Raises:
+        FileFormatError: No such file, not readable, too big or not UTF-8.
+    """
+    try:
+        with open(Path(path).expanduser(), "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        reason = error.strerror or error
+        raise FileFormatError(path, "file", reason, what, "check the path") from None
+    if len(data) > MAX_BYTES:
+        limit = f"{what} of at most {MAX_BYTES // 1_000_000} MB"
+        raise FileFormatError(path, "file", "a larger file", limit, "split it")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        advice = "save it as UTF-8 text"
+        raise FileFormatError(path, "file", f"{error.reason}", f"{what}", advice) from None
+
+
+def write_text(path: str | Path, text: str, field: str = "output") -> None:
+    """Write ``text`` so that the file is either the old one or the whole new one.
+
+    Args:
+        path: The file; an existing one is replaced. A device or pipe is written to directly.
+        text: Its content.
+        field: The argument or option that named the path, for the error.
+
+    Raises:
+        InputError: The path cannot be written.
+    """
+    target = Path(path).expanduser()
+    try:
+        if target.exists() and not target.is_file() and not target.is_dir():
+            target.write_text(text, encoding="utf-8")
+        else:
+            _replace(target.resolve(), text)
+    except OSError as error:
+        reason = f"{path} ({error.strerror or error})"
+        advice = "choose another path or make the folder first"
+        raise InputError(field, reason, "a file path that can be written", advice) from None
+
+
+def _replace(target: Path, text: str) -> None:
+    if target.is_dir():
+        raise IsADirectoryError(21, "is a folder")
+    handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=target.parent)
+    try:
+        with open(handle, "w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, _mode(target))
+        os.replace(name, target)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def _mode(target: Path) -> int:
+    """Permissions of the file to be replaced, or what a new file would get."""
+    if target.exists():
+        return target.stat().st_mode & 0o777
+    mask = os.umask(0)
+    os.umask(mask)
+    return 0o666 & ~mask
