@@ -1,0 +1,8 @@
+"""``python -m calib_planner`` is ``calib-planner``."""
+
+import sys
+
+from calib_planner.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""A plan for people: what it promises first, then the configurations."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from calib_planner.design.plan import Plan
+from calib_planner.robot.chain import Robot
+
+
+def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
+    """Print a plan of ``robot``."""
+    console.print(f"{plan.status}: {plan.message}", style="green" if plan.status == "ok" else "yellow")
+    console.print(
+        f"Predicted accuracy ρ0 {length(plan.predicted_accuracy)} at the test pose"
+        f"{'s (rms)' if len(plan.test_poses) > 1 else ''}, from {plan.measurements} measurements "
+        f"with σ = {length(plan.sigma)}."
+    )
+    console.print(
+        f"No plan of {plan.measurements} measurements is better than {length(plan.lower_bound)} "
+        f"({plan.bound} bound): efficiency {100 * plan.efficiency:.1f} %. "
+        f"Over all joint limits {length(plan.general_accuracy)} (rms)."
+    )
+    console.print(_configurations(plan, robot))
+    if len(plan.test_poses) > 1:
+        per = ", ".join(length(v) for v in plan.predicted_accuracy_per_test_pose)
+        console.print(f"ρ0 per test pose: {per}")
+    unseen = [n for n, s in zip(plan.parameters, plan.parameter_std, strict=True) if not np.isfinite(s)]
+    if unseen:
+        console.print(f"Not determined: {', '.join(unseen)}", style="yellow")
+    console.print(
+        f"{plan.starts} starts, {plan.evaluations} plans evaluated, {plan.seconds:.1f} s, seed {plan.seed}"
+    )
+
+
+def length(metres: float) -> str:
+    """A length with a unit that suits it."""
+    if not np.isfinite(metres):
+        return "unlimited"
+    if abs(metres) < 1e-3:
+        return f"{1e6 * metres:.3g} µm"
+    return f"{1e3 * metres:.4g} mm"
+
+
+def _configurations(plan: Plan, robot: Robot) -> Table:
+    table = Table(title="configurations, in the order of measuring")
+    table.add_column("#", justify="right")
+    for name, turns in zip(plan.joint_names, robot.joint_is_revolute, strict=True):
+        table.add_column(f"{name}\n[{'°' if turns else 'mm'}]", justify="right")
+    table.add_column("measure", justify="right")
+    factors = np.where(robot.joint_is_revolute, 180.0 / np.pi, 1e3)
+    for i, (row, times) in enumerate(zip(plan.configurations * factors, plan.repetitions, strict=True), 1):
+        table.add_row(str(i), *(f"{v:.2f}" for v in row), f"{times}×")
+    return table

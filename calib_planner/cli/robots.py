@@ -1,0 +1,102 @@
+"""``calib-planner robots``: which robots there are, and what each has."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from calib_planner.cli.arguments import Commands, add_command, add_seed
+from calib_planner.cli.terminal import Terminal
+from calib_planner.design.plan import plain
+from calib_planner.robot.catalogue import shipped_robots
+from calib_planner.robot.chain import Robot
+
+EXAMPLE = "calib-planner robots show kuka_kr270"
+
+
+def add(commands: Commands) -> None:
+    """Add the command's parser, and those of list and show."""
+    parser = add_command(commands, "robots", "list the shipped robots, or show one", run_list, EXAMPLE)
+    add_seed(parser)
+    actions = parser.add_subparsers(dest="action", metavar="list|show")
+    add_command(actions, "list", "list the shipped robots", run_list, "calib-planner robots list --json")
+    show = add_command(
+        actions,
+        "show",
+        "show a robot's joints, parameters and targets",
+        run_show,
+        EXAMPLE,
+        "Show a robot's joints, parameters (the names for --parameters) and targets.\n"
+        "Shown in degrees and mm; with --json in radians and m.",
+    )
+    show.add_argument("robot", metavar="R", help="shipped name, robot YAML or URDF")
+    show.add_argument("--base-link", metavar="LINK", help="first link of the chain in a URDF (its root)")
+    show.add_argument("--tip-link", metavar="LINK", help="last link of the chain in a URDF (its only leaf)")
+
+
+def run_list(args: argparse.Namespace, terminal: Terminal) -> None:
+    """Do the work of list."""
+    found = [Robot.load(name) for name in shipped_robots()]
+    rows: list[dict[str, Any]] = [
+        {"name": r.name, "joints": len(r.joint_names), "parameters": list(r.parameter_names)} for r in found
+    ]
+
+    def show(console: Console) -> None:
+        table = Table("robot", "joints", "parameters")
+        for row in rows:
+            table.add_row(row["name"], str(row["joints"]), ", ".join(row["parameters"]))
+        console.print(table)
+
+    terminal.answer({"robots": rows}, show)
+
+
+def run_show(args: argparse.Namespace, terminal: Terminal) -> None:
+    """Do the work of show."""
+    robot = Robot.load(args.robot, base_link=args.base_link, tip_link=args.tip_link)
+    terminal.answer(describe(robot), lambda console: _show(robot, console))
+
+
+def describe(robot: Robot) -> dict[str, Any]:
+    """Plain values, SI units."""
+    everything = robot.with_parameters(robot.available_parameters).parameters
+    result: dict[str, Any] = plain(
+        {
+            "name": robot.name,
+            "joint_names": robot.joint_names,
+            "joint_limits": robot.joint_limits,
+            "joint_units": ["rad" if turns else "m" for turns in robot.joint_is_revolute],
+            "targets": robot.target_offsets,
+            "parameters": robot.parameter_names,
+            "levels": dict(robot.levels),
+            "available_parameters": [
+                {"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in everything
+            ],
+        }
+    )
+    return result
+
+
+def _show(robot: Robot, console: Console) -> None:
+    console.print(f"{robot.name}: {len(robot.joint_names)} joints, {len(robot.targets)} target(s)")
+    joints = Table("joint", "unit", title="joints, in this order")
+    joints.add_column("lower", justify="right")
+    joints.add_column("upper", justify="right")
+    for name, turns, limits in zip(
+        robot.joint_names, robot.joint_is_revolute, robot.joint_limits, strict=True
+    ):
+        shown = np.degrees(limits) if turns else 1e3 * limits
+        joints.add_row(name, "°" if turns else "mm", *(f"{v:.2f}" for v in shown))
+    console.print(joints)
+    parameters = Table("parameter", "unit", "levels", title="parameters of --parameters lengths+offsets")
+    parameters.add_column("nominal", justify="right")
+    for p in robot.parameters:
+        levels = [k for k, names in robot.levels.items() if p.name in names]
+        unit = "mm" if p.unit == "m" else "mrad"
+        parameters.add_row(p.name, unit, ", ".join(levels), f"{1e3 * p.nominal:.4f}")
+    console.print(parameters)
+    more = [n for n in robot.available_parameters if n not in robot.parameter_names]
+    console.print(f"Further parameters: {', '.join(more)}")

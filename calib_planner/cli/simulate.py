@@ -1,0 +1,154 @@
+"""``calib-planner simulate``: measure a plan with a simulated robot and tracker."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from calib_planner._arrays import FloatArray, IntArray, check_count, check_number
+from calib_planner.cli.arguments import (
+    Commands,
+    add_command,
+    add_parameters,
+    add_robot,
+    add_seed,
+    choose_parameters,
+    load_robot,
+)
+from calib_planner.cli.terminal import Terminal
+from calib_planner.demo import independent_seeds
+from calib_planner.design.plan import plain
+from calib_planner.errors import FileFormatError, InputError
+from calib_planner.files.configurations_csv import read_plan_csv
+from calib_planner.files.measurements_csv import measurements_text, write_measurements
+from calib_planner.files.plan_yaml import read_plan
+from calib_planner.robot.chain import Robot
+from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
+
+EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7 --output measured.csv
+  calib-planner identify --robot kuka_kr270 --data measured.csv"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command's parser."""
+    parser = add_command(commands, "simulate", "measure a plan with a simulated robot", run, EXAMPLE)
+    add_robot(parser)
+    add_parameters(parser)
+    parser.add_argument(
+        "--plan",
+        required=True,
+        metavar="FILE",
+        help="plan .yaml, or a .csv with a column per joint and optionally one named repetitions",
+    )
+    parser.add_argument("--repetitions", type=int, metavar="K", help="measurements at each (the plan's)")
+    truth = parser.add_argument_group("the true robot")
+    truth.add_argument(
+        "--true",
+        action="append",
+        type=assignment,
+        metavar="NAME=VALUE",
+        help="true deviation from nominal [m | rad]; repeat; no others then (drawn from the seed)",
+    )
+    truth.add_argument(
+        "--length-error",
+        type=float,
+        default=LENGTH_ERROR,
+        metavar="S",
+        help=f"std of drawn length errors [m] ({LENGTH_ERROR:g})",
+    )
+    truth.add_argument(
+        "--angle-error",
+        type=float,
+        default=ANGLE_ERROR,
+        metavar="S",
+        help=f"std of drawn angle errors [rad] ({ANGLE_ERROR:g})",
+    )
+    truth.add_argument(
+        "--sigma", type=float, default=3e-5, metavar="S", help="tracker's std of one coordinate [m] (3e-5)"
+    )
+    add_seed(truth)
+    parser.add_argument("--output", metavar="FILE", help="CSV of measurements (stdout without --json)")
+
+
+def assignment(text: str) -> tuple[str, float]:
+    """``NAME=VALUE``."""
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected NAME=VALUE, got {text!r}") from None
+
+
+def run(args: argparse.Namespace, terminal: Terminal) -> None:
+    """Do the work."""
+    robot = choose_parameters(load_robot(args), args)
+    configurations, repetitions = _plan(robot, args)
+    check_count("--seed", args.seed, low=0, high=2**63 - 1)
+    truth_seed, noise_seed = independent_seeds(args.seed, 2)
+    errors = _true_errors(robot, args, truth_seed)
+    cell = SimulatedCell(robot, errors, args.sigma)
+    data = cell.measure(configurations, repetitions, noise_seed)
+    result = {
+        "robot": robot.name,
+        "true": [
+            {"name": p.name, "unit": p.unit, "nominal": p.nominal, "deviation": errors[p.name]}
+            for p in robot.with_parameters(tuple(errors)).parameters
+        ],
+        "joint_names": robot.joint_names,
+        "configurations": data.q,
+        "points": data.p,
+        "measurements": len(data),
+        "sigma": args.sigma,
+        "seed": args.seed,
+        "output": args.output,
+    }
+    if args.output:
+        write_measurements(args.output, data, "--output")
+    elif not args.json:
+        print(measurements_text(data), end="")
+    if args.json:
+        terminal.answer(plain(result), lambda console: None)
+    else:
+        _show(result, terminal.out if args.output else terminal.err)
+
+
+def _plan(robot: Robot, args: argparse.Namespace) -> tuple[FloatArray, IntArray | int]:
+    """Configurations (N, joints) and how often each is measured."""
+    if args.plan.lower().endswith((".yaml", ".yml")):
+        plan = read_plan(args.plan)
+        if set(plan.joint_names) != set(robot.joint_names):
+            wanted = f"the robot's joints {', '.join(robot.joint_names)}"
+            raise FileFormatError(args.plan, "joint_names", ", ".join(plan.joint_names), wanted)
+        q = plan.configurations[:, [plan.joint_names.index(n) for n in robot.joint_names]]
+        repetitions = plan.repetitions
+    else:
+        q, repetitions = read_plan_csv(args.plan, robot, degrees=args.degrees)
+    return q, repetitions if args.repetitions is None else args.repetitions
+
+
+def _true_errors(robot: Robot, args: argparse.Namespace, seed: int) -> dict[str, float]:
+    if args.true is None:
+        for option in ("length_error", "angle_error"):
+            check_number(f"--{option.replace('_', '-')}", getattr(args, option), low=0, high=1)
+        return random_deviations(robot, seed, args.length_error, args.angle_error)
+    errors: dict[str, float] = dict(args.true)
+    for name, value in errors.items():
+        if not np.isfinite(value):
+            raise InputError(f"--true {name}", value, "a finite deviation [m | rad]")
+    robot.with_deviations(errors)  # refuses unknown names
+    return errors
+
+
+def _show(result: dict[str, Any], console: Console) -> None:
+    table = Table("parameter", "unit", title="true deviations")
+    table.add_column("deviation", justify="right")
+    for row in result["true"]:
+        unit = "mm" if row["unit"] == "m" else "mrad"
+        table.add_row(row["name"], unit, f"{1e3 * row['deviation']:+.4f}")
+    console.print(table)
+    where = f" written to {result['output']}" if result["output"] else ""
+    console.print(f"{result['measurements']} measurements{where}, seed {result['seed']}")

@@ -1,0 +1,101 @@
+"""What a command may say and where: the answer on stdout, everything else on stderr."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+PATIENCE = 1.0
+"""Work shorter than this shows no progress [s]."""
+
+WIDTH = 110
+"""Columns of a table that does not go to a terminal."""
+
+
+class Terminal:
+    """The two streams of one run.
+
+    Args:
+        json_wanted: The answer is one JSON object; tables are not shown.
+    """
+
+    def __init__(self, *, json_wanted: bool) -> None:
+        self.json_wanted = json_wanted
+        self.out = _console(sys.stdout)
+        self.err = _console(sys.stderr)
+
+    def answer(self, result: Mapping[str, Any], show: Callable[[Console], None]) -> None:
+        """Print ``result`` as JSON if that is wanted, otherwise what ``show`` prints."""
+        if self.json_wanted:
+            print(json.dumps(result, allow_nan=False, ensure_ascii=False))
+        else:
+            show(self.out)
+
+    def note(self, text: str) -> None:
+        """Say something that is not the answer."""
+        self.err.print(text, soft_wrap=True)
+
+    def fail(self, command: str, reason: str) -> None:
+        """Say in one line why the work could not be done."""
+        one_line = " ".join(reason.split())
+        print(f"calib-planner {command}: {one_line}", file=sys.stderr)
+
+    @contextmanager
+    def progress(self, label: str) -> Iterator[Callable[[float, str], None]]:
+        """A bar on stderr, if that is a terminal, once the work has taken over a second.
+
+        Yields a function (share done 0 … 1, text) to be called as the work goes on.
+        """
+        bar = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[text]}", markup=False),
+            console=self.err,
+            transient=True,
+        )
+        task = bar.add_task(label, total=1.0, text="")
+        began = time.perf_counter()
+        shown = False
+
+        def update(share: float, text: str) -> None:
+            nonlocal shown
+            bar.update(task, completed=share, text=text)
+            if not shown and self.err.is_terminal and time.perf_counter() - began > PATIENCE:
+                bar.start()
+                shown = True
+
+        try:
+            yield update
+        finally:
+            if shown:
+                bar.stop()
+
+    @contextmanager
+    def working(self, label: str) -> Iterator[None]:
+        """A sign of life on stderr, if that is a terminal, for work that cannot tell how far it is."""
+        status = self.err.status(label)
+        timer = threading.Timer(PATIENCE, status.start)
+        timer.daemon = True
+        if self.err.is_terminal:
+            timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            if timer.is_alive():
+                timer.join()
+            status.stop()
+
+
+def _console(stream: Any) -> Console:
+    width = None if stream.isatty() else WIDTH
+    return Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
