@@ -59,7 +59,7 @@ class SimulatedCell:
             check_count("repetitions", repetitions)
         elif np.shape(repetitions) != (len(q),):
             raise InputError("repetitions", np.shape(repetitions), f"one number or {len(q)} numbers")
-        rows = np.repeat(q, repetitions, axis=0)
+        rows = np.repeat(q, np.asarray(repetitions, np.int64), axis=0)
         rng = np.random.default_rng(seed)
         points = self.truth.positions(rows)
         noisy = points + self.sigma * rng.standard_normal(points.shape)

@@ -26,11 +26,11 @@ from calib_planner._arrays import FloatArray
 from calib_planner.design.search.descent import descend
 from calib_planner.robot.chain import Robot
 
-
 SPREAD = 256
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
-"""Weight of a spread of random configurations in every measure. The optimum is often singular; the floor keeps
-M invertible and d smooth, and costs the bound less than its weight times the price of a random plan."""
+"""Weight of a spread of random configurations in every measure, first and last. The optimum is often singular;
+the floor keeps M invertible and d smooth, and costs the bound about its weight times the price of a random
+plan."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,8 @@ def relaxed_design(
     """
     low, high = robot.joint_limits.T
     everywhere = _unit_information(robot, rng.uniform(low, high, (SPREAD, len(low)))).mean(axis=0)
-    support, weights = start, np.full(len(start), 1.0 / len(start))
+    support: FloatArray = start
+    weights: FloatArray = np.full(len(start), 1.0 / len(start))
     best_value, best_bound, best = np.inf, 0.0, (support, weights)
     for step in range(rounds):
         floor = max(FIRST_FLOOR * 0.7**step, LAST_FLOOR)

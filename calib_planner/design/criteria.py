@@ -36,7 +36,7 @@ class LinearCriterion:
         return np.trace(half, axis1=1, axis2=2), -(half @ inverse)
 
 
-def test_pose_weight(jacobians: FloatArray, weights: FloatArray) -> FloatArray:
+def accuracy_weight(jacobians: FloatArray, weights: FloatArray) -> FloatArray:
     """A of eq. (14): ``jacobians`` (K, 3·targets, P) at the test poses, ``weights`` (K,); returns (P, P)."""
     share = weights / weights.sum() / (jacobians.shape[1] / 3)
     return np.einsum("k,kia,kib->ab", share, jacobians, jacobians)

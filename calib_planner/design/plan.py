@@ -35,7 +35,9 @@ class Plan:
         sigma: Standard deviation of one coordinate [m].
         predicted_accuracy: ρ0 of eq. (14), root mean square over the test poses [m].
         predicted_accuracy_per_test_pose: (K,) [m].
-        parameter_std: (P,) predicted standard deviation of each parameter, infinite if unseen [m | rad].
+        parameter_std: (P,) predicted standard deviation of each parameter [m | rad]; infinite if this plan
+            does not see it, NaN if no plan can tell it from others.
+        unidentifiable: Combinations of parameters that no configuration within the limits can tell apart.
         general_accuracy: Root mean square error over random configurations within the limits [m].
         lower_bound: No plan with as many measurements has a smaller ρ0 [m].
         efficiency: lower_bound / predicted_accuracy, at most 1.
@@ -60,6 +62,7 @@ class Plan:
     predicted_accuracy: float
     predicted_accuracy_per_test_pose: FloatArray
     parameter_std: FloatArray
+    unidentifiable: tuple[str, ...]
     general_accuracy: float
     lower_bound: float
     efficiency: float

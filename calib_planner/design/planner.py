@@ -10,15 +10,13 @@ import numpy as np
 
 from calib_planner._arrays import FloatArray
 from calib_planner.design.bound import relaxed_design
-from calib_planner.design.criteria import LinearCriterion, test_pose_weight
+from calib_planner.design.criteria import LinearCriterion, accuracy_weight
+from calib_planner.design.identifiability import Identifiability, analyse
 from calib_planner.design.information import covariance, error_variance, information
 from calib_planner.design.plan import STATUS, Plan
-from calib_planner.design.problem import PlanProblem
+from calib_planner.design.problem import SAMPLE, PlanProblem, reachable_sample
 from calib_planner.design.search.multistart import SearchResult, search
 from calib_planner.robot.chain import Robot
-
-SAMPLE = 512
-"""Random configurations that stand for the whole workspace."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +45,49 @@ def plan(problem: PlanProblem, callback: Callable[[Progress], bool | None] | Non
         callback: Told of progress; returning ``True`` cancels, the best plan so far being returned.
     """
     clock = _Clock(problem, callback)
-    robot = problem.robot
     rng = np.random.default_rng(problem.seed)
-    test_jacobians = robot.jacobian(problem.test_pose_array)
-    weight = test_pose_weight(test_jacobians, problem.weight_array)
-    low, high = robot.joint_limits.T
-    sample = robot.jacobian(rng.uniform(low, high, (SAMPLE, len(low))))
-    general = test_pose_weight(sample, np.ones(SAMPLE))
+    space = _space(problem)
     share = problem.general_weight
-    criterion = LinearCriterion((1.0 - share) * weight + share * general)
-    found = search(robot, criterion, problem.configurations, problem.starts, rng, clock.stop, clock.starts)
-    bound = _bound(problem, weight, found, rng, clock)
-    return _assemble(problem, found, bound, test_jacobians, general, clock)
+    criterion = LinearCriterion((1.0 - share) * space.weight + share * space.general)
+    robot, size = space.robot, problem.configurations
+    found = search(robot, criterion, size, problem.starts, rng, clock.stop, clock.starts)
+    bound = _bound(problem, space, found, rng, clock)
+    return _assemble(problem, space, found, bound, clock)
+
+
+@dataclass(frozen=True)
+class _Space:
+    """The problem in parameters that some plan can tell apart.
+
+    Attributes:
+        robot: The robot, active in those parameters only.
+        identifiability: Which of the problem's parameters those are.
+        test_jacobians: (K, 3·targets, r) at the test poses.
+        weight: (r, r) matrix A of eq. (14).
+        general: (r, r) the same for the whole workspace.
+    """
+
+    robot: Robot
+    identifiability: Identifiability
+    test_jacobians: FloatArray
+    weight: FloatArray
+    general: FloatArray
+
+
+def _space(problem: PlanProblem) -> _Space:
+    names = problem.robot.parameter_names
+    sample = reachable_sample(problem.robot, SAMPLE)
+    found = analyse(sample.reshape(-1, len(names)), names)
+    kept = sorted(found.kept)
+    robot = problem.robot.with_parameters([names[i] for i in kept])
+    tests = robot.jacobian(problem.test_pose_array)
+    return _Space(
+        robot=robot,
+        identifiability=found,
+        test_jacobians=tests,
+        weight=accuracy_weight(tests, problem.weight_array),
+        general=accuracy_weight(sample[:, :, kept], np.ones(len(sample))),
+    )
 
 
 class _Clock:
@@ -99,44 +128,33 @@ class _Clock:
 
 
 def _bound(
-    problem: PlanProblem,
-    weight: FloatArray,
-    found: SearchResult,
-    rng: np.random.Generator,
-    clock: _Clock,
+    problem: PlanProblem, space: _Space, found: SearchResult, rng: np.random.Generator, clock: _Clock
 ) -> float:
     """Lower bound on ρ0 [m] for the plan's number of measurements."""
     start = np.concatenate([found.configurations, problem.test_pose_array])
-    relaxed = relaxed_design(problem.robot, weight, start, rng, clock.stop)
+    relaxed = relaxed_design(space.robot, space.weight, start, rng, clock.stop)
     total = problem.configurations * problem.repetitions
     return problem.sigma * float(np.sqrt(relaxed.bound / total))
 
 
-def _assemble(
-    problem: PlanProblem,
-    found: SearchResult,
-    bound: float,
-    test_jacobians: FloatArray,
-    general: FloatArray,
-    clock: _Clock,
-) -> Plan:
-    robot, sigma = problem.robot, problem.sigma
+def _assemble(problem: PlanProblem, space: _Space, found: SearchResult, bound: float, clock: _Clock) -> Plan:
+    robot, sigma = space.robot, problem.sigma
     configurations = visiting_order(found.configurations, robot)
     repetitions = np.full(len(configurations), problem.repetitions)
     matrix = information(robot.jacobian(configurations), repetitions)
-    per = sigma * np.sqrt([error_variance(j, matrix) for j in test_jacobians])
+    per = sigma * np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
     weights = problem.weight_array / problem.weight_array.sum()
     accuracy = float(np.sqrt(weights @ per**2)) if np.isfinite(per).all() else float("inf")
     inverse, hidden = covariance(matrix)
-    unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(matrix), bool)
-    std = np.where(unseen, np.inf, sigma * np.sqrt(np.diag(inverse)))
+    general = float("inf") if hidden.size else float(np.trace(space.general @ inverse))
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
     status = "singular" if hidden.size and status == "ok" else status
-    trace = float(np.trace(general @ inverse))
+    combinations = space.identifiability.combinations
+    note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}."
     return Plan(
         robot=robot.name,
         criterion=problem.criterion,
-        parameters=robot.parameter_names,
+        parameters=problem.robot.parameter_names,
         joint_names=robot.joint_names,
         configurations=configurations,
         repetitions=repetitions,
@@ -145,18 +163,28 @@ def _assemble(
         sigma=sigma,
         predicted_accuracy=accuracy,
         predicted_accuracy_per_test_pose=per,
-        parameter_std=std,
-        general_accuracy=float("inf") if hidden.size else sigma * float(np.sqrt(trace)),
+        parameter_std=sigma * _parameter_deviations(space, inverse, hidden),
+        unidentifiable=combinations,
+        general_accuracy=sigma * float(np.sqrt(general)),
         lower_bound=bound,
         efficiency=bound / accuracy if np.isfinite(accuracy) else 0.0,
         bound="numerical",
         status=status,
-        message=STATUS[status],
+        message=STATUS[status] + (note if combinations else ""),
         seconds=clock.seconds,
         seed=problem.seed,
         starts=found.starts,
         evaluations=found.evaluations,
     )
+
+
+def _parameter_deviations(space: _Space, inverse: FloatArray, hidden: FloatArray) -> FloatArray:
+    """(P,) standard deviations for σ = 1: infinite where this plan is blind, NaN where every plan is."""
+    kept = sorted(space.identifiability.kept)
+    unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(kept), bool)
+    std = np.full(len(kept) + len(space.identifiability.held), np.nan)
+    std[kept] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)))
+    return std
 
 
 def visiting_order(configurations: FloatArray, robot: Robot) -> FloatArray:

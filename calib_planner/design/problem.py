@@ -14,10 +14,13 @@ from calib_planner._arrays import (
     check_count,
     check_number,
 )
+from calib_planner.design.identifiability import analyse
 from calib_planner.errors import InfeasibleError, InputError, UnknownNameError
 from calib_planner.robot.chain import Robot
 
 CRITERIA = ("test_pose",)
+SAMPLE = 512
+"""Random configurations that stand for the whole workspace."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,26 +114,30 @@ def _check_within_limits(robot: Robot, poses: FloatArray) -> None:
         )
 
 
-def _check_enough(robot: Robot, configurations: int) -> None:
-    """Refuse what no choice of configurations can identify."""
+def reachable_sample(robot: Robot, count: int) -> FloatArray:
+    """(count, 3·targets, P) Jacobians at fixed random configurations within the joint limits."""
     low, high = robot.joint_limits.T
-    sample = np.random.default_rng(0).uniform(low, high, (64, len(low)))
-    jacobian = robot.jacobian(sample)
+    return robot.jacobian(np.random.default_rng(0).uniform(low, high, (count, len(low))))
+
+
+def _check_enough(robot: Robot, configurations: int) -> None:
+    """Refuse what so few configurations cannot identify, whichever they are."""
+    jacobians = reachable_sample(robot, SAMPLE)
     names = robot.parameter_names
-    norms = np.linalg.norm(jacobian.reshape(-1, len(names)), axis=0)
-    blind = [n for n, v in zip(names, norms, strict=True) if v < 1e-12]
-    if blind:
+    if not names:
+        raise InputError("robot", "a robot without active parameters", "use robot.with_parameters(...)")
+    rank = analyse(jacobians.reshape(-1, len(names)), names).rank
+    if rank == 0:
         raise InfeasibleError(
             "parameters",
-            f"no measurement of these targets depends on {', '.join(blind)}; leave them out of the "
-            "parameters, or give the tool a target off the last axis",
+            f"no measurement of these targets depends on {', '.join(names)}; choose other parameters, or "
+            "give the tool a target off the last axis",
         )
-    per_row = int(np.linalg.matrix_rank(jacobian[0])) if len(names) else 0
-    per_row = max(per_row, 1, *(int(np.linalg.matrix_rank(j)) for j in jacobian[1:8]))
-    needed = -(-len(names) // per_row)
+    per_row = max(int(np.linalg.matrix_rank(j)) for j in jacobians[:8])
+    needed = -(-rank // per_row)
     if configurations < needed:
         raise InfeasibleError(
             "configurations",
             f"{configurations} configurations give at most {configurations * per_row} equations for "
-            f"{len(names)} parameters; ask for at least {needed}, or for fewer parameters",
+            f"{rank} identifiable parameters; ask for at least {needed}, or for fewer parameters",
         )

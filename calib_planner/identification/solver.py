@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_planner._arrays import FloatArray
+from calib_planner.design.identifiability import Identifiability, analyse
 from calib_planner.design.information import error_variance
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.estimate import STATUS, Estimate, residual_statistics
-from calib_planner.identification.identifiability import Identifiability, analyse
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
@@ -99,7 +99,7 @@ class _Fit:
 
 def _iterate(system: _System, deviations: FloatArray, most: int) -> _Fit:
     residuals, jacobian = system.linearise(deviations)
-    found = analyse(jacobian, system.robot.parameter_names)
+    found = analyse(jacobian / system.weights.max(), system.robot.parameter_names)
     kept = list(found.kept)
     damping, done = 0.0, 0
     converged = not kept

@@ -17,6 +17,8 @@ from calib_planner._arrays import FloatArray
 
 TOLERANCE = 1e-6
 """A unit column this close to the span of its predecessors is taken as dependent."""
+NO_LEVER = 1e-12
+"""A parameter that moves the targets by less than this per unit does not move them at all [m]."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,12 @@ def analyse(jacobian: FloatArray, names: Sequence[str], tolerance: float = TOLER
     """Choose an irreducible set of parameters.
 
     Args:
-        jacobian: (equations, P), weighted.
+        jacobian: (equations, P), weights of the equations around one [m/m | m/rad].
         names: P parameter names.
         tolerance: See ``TOLERANCE``.
     """
     norms = np.linalg.norm(jacobian, axis=0)
-    largest = norms.max(initial=0.0)
-    scale = np.where(norms > 1e-14 * largest, norms, 0.0)
+    scale = np.where(norms > NO_LEVER * np.sqrt(len(jacobian)), norms, 0.0)
     unit = np.divide(jacobian, scale, out=np.zeros_like(jacobian), where=scale > 0)
     first = [i for i, n in enumerate(names) if n.startswith(("base.", "target_"))]
     order = first + [i for i in range(len(names)) if i not in first]

@@ -1,0 +1,52 @@
+"""Robots that the tests share: the shipped ones and a URDF with every kind of joint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calib_planner import Robot
+from calib_planner.robot.urdf import parse_urdf
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+MIXED_URDF = """<?xml version="1.0"?>
+<robot name="mixed">
+  <link name="base"/><link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="tip"/>
+  <joint name="turn" type="revolute"><origin xyz="0.1 -0.2 0.3" rpy="0.3 -0.4 0.5"/>
+    <parent link="base"/><child link="a"/><axis xyz="0.6 -0.48 0.64"/>
+    <limit lower="-2" upper="2.5" effort="1" velocity="1"/></joint>
+  <joint name="slide" type="prismatic"><origin xyz="0.2 0 0.4" rpy="0 0.7 0"/>
+    <parent link="a"/><child link="b"/><axis xyz="0 -1 0"/>
+    <limit lower="-0.3" upper="0.8" effort="1" velocity="1"/></joint>
+  <joint name="bracket" type="fixed"><origin xyz="0 0.3 0" rpy="1.5707963267948966 0 0"/>
+    <parent link="b"/><child link="c"/></joint>
+  <joint name="spin" type="continuous"><origin xyz="0 0 0.5"/>
+    <parent link="c"/><child link="d"/><axis xyz="0 0 -1"/></joint>
+  <joint name="nod" type="revolute"><origin xyz="0.3 0 0" rpy="0 0 1"/>
+    <parent link="d"/><child link="tip"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>
+"""
+
+
+def mixed() -> Robot:
+    """A chain with revolute, prismatic, continuous and fixed joints and an oblique axis; two targets."""
+    return parse_urdf(MIXED_URDF, "mixed.urdf").with_targets([[0.1, 0.02, 0.3], [-0.05, 0.2, 0.1]])
+
+
+def random_configurations(robot: Robot, count: int, seed: int = 0) -> np.ndarray:
+    """(count, joints) uniform within the joint limits."""
+    low, high = robot.joint_limits.T
+    return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+
+
+CASES = {
+    "planar_2r": lambda: Robot.load("planar_2r"),
+    "kuka_kr270": lambda: Robot.load("kuka_kr270"),
+    "kuka_kr270 full": lambda: Robot.load("kuka_kr270").with_parameters("full", ("base", "tool")),
+    "mixed lengths+offsets": mixed,
+    "mixed offsets": lambda: mixed().with_parameters("offsets"),
+    "mixed full": lambda: mixed().with_parameters("full", ("base", "tool")),
+}
