@@ -28,8 +28,8 @@ from calib_planner.robot.chain import Robot
 
 SPREAD = 256
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
-"""Weight of a spread of random configurations in every measure, first and last. The optimum is often singular;
-the floor keeps M invertible and d smooth, and costs the bound about its weight times the price of a random
+"""Weight of a spread of random configurations in every measure, first and last. The optimum is often singular:
+it keeps M invertible and d smooth, and costs the bound about its weight times the price of a random
 plan."""
 
 
