@@ -27,9 +27,11 @@ def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
     if len(plan.test_poses) > 1:
         per = ", ".join(length(v) for v in plan.predicted_accuracy_per_test_pose)
         console.print(f"ρ0 per test pose: {per}")
-    unseen = [n for n, s in zip(plan.parameters, plan.parameter_std, strict=True) if not np.isfinite(s)]
+    unseen = [n for n, s in zip(plan.parameters, plan.parameter_std, strict=True) if np.isinf(s)]
     if unseen:
-        console.print(f"Not determined: {', '.join(unseen)}", style="yellow")
+        console.print(f"Not seen by this plan: {', '.join(unseen)}", style="yellow")
+    for combination in plan.unidentifiable:
+        console.print(f"No plan can tell apart: {combination}", soft_wrap=True)
     console.print(
         f"{plan.starts} starts, {plan.evaluations} plans evaluated, {plan.seconds:.1f} s, seed {plan.seed}"
     )

@@ -96,6 +96,12 @@ class Terminal:
             status.stop()
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to ``main``; rich would exit on its own."""
+        raise
+
+
 def _console(stream: Any) -> Console:
     width = None if stream.isatty() else WIDTH
-    return Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
+    return _Console(file=stream, width=width, markup=False, highlight=False, emoji=False)

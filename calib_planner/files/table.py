@@ -100,8 +100,9 @@ def require_columns(table: Table, names: Sequence[str], what: str) -> None:
     missing = [n for n in names if n not in table.columns]
     if not missing:
         return
-    close = get_close_matches(missing[0], table.columns, n=1)
-    advice = f"is {close[0]!r} meant to be {missing[0]!r}?" if close else "rename or add them"
+    others = {c.casefold(): c for c in table.columns if c not in names}
+    close = get_close_matches(missing[0].casefold(), others, n=1)
+    advice = f"is {others[close[0]]!r} meant to be {missing[0]!r}?" if close else "rename or add them"
     raise FileFormatError(
         table.path,
         "header",

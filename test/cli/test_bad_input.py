@@ -1,0 +1,124 @@
+"""Bad input: exit status, one line that names what is wrong and what is valid, nothing on stdout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calib_planner.cli import main
+from calib_planner.cli.main import bind_negative
+
+PLAN = "plan --robot planar_2r --starts 2 --configurations"
+IDENTIFY = "identify --robot planar_2r --data"
+SIMULATE = "simulate --robot planar_2r --plan"
+
+FILES = {
+    "good.csv": "q1,q2,x1,y1,z1\n0,0,1.8,0,0\n0.5,0.7,1.17,1.22,0\n1,-1,1.34,0.84,0\n",
+    "two.csv": "q1,q2,x1,y1,z1,x2,y2,z2\n0,0,1.8,0,0,1.8,0,0\n0,1,1.4,0.7,0,1.4,0.7,0\n",
+    "one_row.csv": "q1,q2,x1,y1,z1\n0,0,1.8,0,0\n",
+    "unseen.csv": "q1,q2,x1,y1,z1\n0,0,,,\n",
+    "word.csv": "q1,q2,x1,y1,z1\n0,zero,1.8,0,0\n",
+    "nan.csv": "q1,q2,x1,y1,z1\n0,nan,1.8,0,0\n",
+    "joints.csv": "q1,q3,x1,y1,z1\n0,0,1.8,0,0\n",
+    "bad.urdf": "<robot name='x'><link",
+    "empty.urdf": "<robot name='x'/>",
+    "other.xml.urdf": "<sdf/>",
+    "bad.yaml": "joints: [",
+    "keys.yaml": "joints: []\ncolour: red\n",
+    "plan.yaml": "format: calib_planner/plan\nrobot: planar_2r\n",
+}
+
+CASES = {
+    # wrong usage: 2
+    "no command": ("", 2, ["required", "COMMAND"]),
+    "unknown command": ("calibrate", 2, ["calibrate", "identify"]),
+    "unknown flag": (f"{PLAN} 2 --test-pose 0,0 --speed 3", 2, ["--speed"]),
+    "abbreviated flag": (f"{PLAN} 2 --test-po 0,0", 2, ["--test-po"]),
+    "no robot": ("plan --configurations 2", 2, ["--robot"]),
+    "no test pose": (f"{PLAN} 2", 2, ["--test-pose", "q1, q2", "--test-path"]),
+    "robot name": (
+        "plan --robot planar_2 --configurations 2 --test-pose 0,0",
+        2,
+        ["robot", "'planar_2'", "kuka_kr270", "did you mean 'planar_2r'"],
+    ),
+    "parameter name": (f"{PLAN} 2 --test-pose 0,0 --parameters l1,l3", 2, ["parameters", "'l3'", "dq1"]),
+    "parameter twice": (f"{PLAN} 2 --test-pose 0,0 --parameters l1,l1", 2, ["l1", "at most once"]),
+    "unknown unknown": (f"{PLAN} 2 --test-pose 0,0 --unknown flange", 2, ["'flange'", "base, tool"]),
+    "pose of words": (f"{PLAN} 2 --test-pose zero", 2, ["--test-pose", "expected numbers", "zero"]),
+    "pose too long": (f"{PLAN} 2 --test-pose 0,0,0", 2, ["--test-pose", "3 numbers", "2 numbers: q1, q2"]),
+    "pose is NaN": (f"{PLAN} 2 --test-pose 0,nan", 2, ["--test-pose", "finite"]),
+    "pose in degrees": (f"{PLAN} 2 --test-pose 0,90", 2, ["joint q2", "limits", "degrees"]),
+    "weights": (f"{PLAN} 2 --test-pose 0,0 --weights 1,2", 2, ["weights", "(2,)", "shape (1)"]),
+    "weights below zero": (f"{PLAN} 2 --test-pose 0,0 --weights -1", 2, ["weights", ">= 0"]),
+    "no configurations": (f"{PLAN} 0 --test-pose 0,0", 2, ["configurations", "0", "from 1"]),
+    "half a configuration": (f"{PLAN} 1.5 --test-pose 0,0", 2, ["--configurations", "1.5"]),
+    "sigma": (f"{PLAN} 2 --test-pose 0,0 --sigma -1", 2, ["sigma", "-1", " m"]),
+    "sigma is NaN": (f"{PLAN} 2 --test-pose 0,0 --sigma nan", 2, ["sigma", "nan"]),
+    "time limit": (f"{PLAN} 2 --test-pose 0,0 --time-limit 0", 2, ["time_limit", "seconds > 0"]),
+    "seed": (f"{PLAN} 2 --test-pose 0,0 --seed -1", 2, ["seed", "whole number from 0"]),
+    "criterion": (f"{PLAN} 2 --test-pose 0,0 --criterion z", 2, ["--criterion", "test_pose"]),
+    "targets": (f"{PLAN} 2 --test-pose 0,0 --targets 1,2", 2, ["--targets", "3 numbers: x, y, z"]),
+    "plan's ending": (f"{PLAN} 2 --test-pose 0,0 --output p.txt", 2, ["--output", ".yaml or .csv"]),
+    "output folder": (f"{PLAN} 2 --test-pose 0,0 --output no/p.csv", 2, ["--output", "No such file"]),
+    "loss": (f"{IDENTIFY} good.csv --loss robust", 2, ["--loss", "linear"]),
+    "target from": (f"{IDENTIFY} good.csv --validate-target-from 1", 2, ["--validate FILE"]),
+    "true name": (f"{SIMULATE} good.csv --true l9=1", 2, ["deviations", "'l9'", "l1"]),
+    "true text": (f"{SIMULATE} good.csv --true l1", 2, ["NAME=VALUE"]),
+    "true NaN": (f"{SIMULATE} good.csv --true l1=nan", 2, ["--true l1", "finite"]),
+    "length error": (f"{SIMULATE} good.csv --length-error -1", 2, ["--length-error"]),
+    "demo folder": ("demo --output good.csv/x", 2, ["output", "choose another"]),
+    # the work could not be done: 1
+    "too few configurations": (f"{PLAN} 1 --test-pose 0,0", 1, ["1 configurations", "at least 2"]),
+    "no such file": (f"{IDENTIFY} none.csv", 1, ["none.csv", "No such file", "check the path"]),
+    "no such plan": (f"{SIMULATE} none.yaml", 1, ["none.yaml", "No such file"]),
+    "cell": (f"{IDENTIFY} word.csv", 1, ["word.csv", "line 2, column q2", "'zero'", "finite number"]),
+    "NaN in a cell": (f"{IDENTIFY} nan.csv", 1, ["nan.csv", "line 2, column q2", "'nan'"]),
+    "joint name": (f"{IDENTIFY} joints.csv", 1, ["no column q2", "q1, q3", "rename or add them"]),
+    "too few points": (f"{IDENTIFY} one_row.csv", 1, ["3 equations for 4 parameters", "at least 2"]),
+    "nothing measured": (f"{IDENTIFY} unseen.csv", 1, ["no measured points"]),
+    "targets of the data": (f"{IDENTIFY} two.csv", 1, ["2 targets", "--targets", "--unknown tool"]),
+    "validation too short": (
+        f"{IDENTIFY} good.csv --validate one_row.csv --validate-target-from 1",
+        1,
+        ["1 validation rows", "nothing is left"],
+    ),
+    "URDF syntax": ("robots show bad.urdf", 1, ["bad.urdf", "XML", "well-formed"]),
+    "URDF without joints": ("robots show empty.urdf", 1, ["empty.urdf"]),
+    "not a URDF": ("robots show other.xml.urdf", 1, ["<sdf>", "<robot>"]),
+    "YAML syntax": ("robots show bad.yaml", 1, ["bad.yaml", "readable YAML"]),
+    "YAML keys": ("robots show keys.yaml", 1, ["keys.yaml", "'colour'", "joints"]),
+    "plan without keys": (f"{SIMULATE} plan.yaml", 1, ["plan.yaml", "no key 'criterion'"]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, status, words = CASES[case]
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == status
+    out, err = capsys.readouterr()
+    assert out == "" and "Traceback" not in err
+    assert all(word in err for word in words), err
+    if status == 1:
+        assert err.count("\n") == 1 and err.startswith(f"calib-planner {command.split()[0]}: ")
+
+
+def test_an_estimate_that_does_not_settle_is_no_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, output = tmp_path / "good.csv", tmp_path / "estimate.yaml"
+    path.write_text(FILES["good.csv"])
+    words = f"{IDENTIFY} {path} --iterations 1 --output {output}"
+    assert main(words.split()) == 1
+    out, err = capsys.readouterr()
+    assert "not_converged" in out and "Nothing was written" in err and not output.exists()
+
+
+def test_bind_negative() -> None:
+    assert bind_negative(["--a", "-1", "--b", "-.5,2", "-3"]) == ["--a=-1", "--b=-.5,2", "-3"]
+    assert bind_negative(["--a=1", "-2", "-h"]) == ["--a=1", "-2", "-h"]

@@ -1,0 +1,207 @@
+"""The commands as a user runs them: the contract's JSON keys, files that feed the next command, status."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from robots import SHARED_DATA
+
+from calib_planner import Robot, __version__
+from calib_planner.cli import main
+from calib_planner.files.estimate_yaml import read_estimate
+from calib_planner.files.plan_yaml import read_plan
+
+POSE = "0 -60 90 0 45 0"
+PLAN = ["plan", "--robot", "kuka_kr270", "--degrees", "--test-pose", POSE, "--starts", "8"]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Any:
+    """Run a command that works; its JSON (with --json) or its stdout."""
+
+    def run(*argv: str) -> Any:
+        assert main(argv) == 0, capsys.readouterr().err
+        out = capsys.readouterr().out
+        return json.loads(out) if "--json" in argv else out
+
+    return run
+
+
+def test_plan_simulate_identify(call: Any, tmp_path: Path) -> None:
+    plan_file, data, estimate_file = (str(tmp_path / n) for n in ("plan.yaml", "data.csv", "estimate.yaml"))
+    found = call(*PLAN, "--configurations", "4", "--repetitions", "3", "--json", "--output", plan_file)
+    keys = "robot criterion parameters joint_names configurations repetitions predicted_accuracy"
+    more = "predicted_accuracy_per_test_pose lower_bound efficiency bound status message seconds seed"
+    assert found.keys() >= {*keys.split(), *more.split()}
+    assert found["repetitions"] == [3] * 4 and np.shape(found["configurations"]) == (4, 6)
+    assert 0 < found["lower_bound"] <= found["predicted_accuracy"] < 3e-5
+    assert found["efficiency"] == found["lower_bound"] / found["predicted_accuracy"]
+    np.testing.assert_array_equal(read_plan(plan_file).configurations, found["configurations"])
+
+    arguments = ("--robot", "kuka_kr270", "--seed", "3", "--json")
+    made = call("simulate", *arguments, "--plan", plan_file, "--output", data)
+    assert made["measurements"] == 12
+    result = call(
+        "identify", *arguments, "--data", data, "--sigma", "3e-5", "--output", estimate_file,
+        "--test-pose", " ".join(str(v) for v in np.radians([0, -60, 90, 0, 45, 0])),
+    )  # fmt: skip
+    keys = "parameters rank unidentifiable measurements used rejected sigma_estimate residual_before"
+    assert result.keys() >= {*keys.split(), "residual_after", "predicted_accuracy", "status", "seconds"}
+    true = {row["name"]: row["deviation"] for row in made["true"]}
+    for row in result["parameters"]:
+        assert row.keys() == {"name", "unit", "nominal", "value", "deviation", "std"}
+        assert abs(row["deviation"] - true[row["name"]]) < 4 * row["std"]
+    assert result["residual_after"].keys() == {"mean", "rms", "max"}
+    assert result["predicted_accuracy"] == pytest.approx(found["predicted_accuracy"], rel=0.02)
+    assert read_estimate(estimate_file).parameters == tuple(true)
+
+
+def test_csv_plan_and_csv_on_stdout(call: Any, tmp_path: Path) -> None:
+    path = str(tmp_path / "plan.csv")
+    found = call(
+        "plan", "--robot", "planar_2r", "--test-path", str(_poses(tmp_path)), "--weights", "1 2",
+        "--configurations", "3", "--starts", "4", "--json", "--output", path,
+    )  # fmt: skip
+    assert len(found["predicted_accuracy_per_test_pose"]) == 2
+    per, w = np.array(found["predicted_accuracy_per_test_pose"]), np.array([1, 2]) / 3
+    assert found["predicted_accuracy"] == pytest.approx(np.sqrt(w @ per**2))
+    lines = call("simulate", "--robot", "planar_2r", "--plan", path, "--true", "l1=0.001", "--sigma", "0")
+    header, *rows = lines.splitlines()
+    assert header == "q1,q2,x1,y1,z1" and len(rows) == 3
+    q, p = np.split(np.array([[float(v) for v in row.split(",")] for row in rows]), [2], axis=1)
+    truth = Robot.load("planar_2r").with_deviations({"l1": 1e-3})
+    np.testing.assert_array_equal(truth.positions(q)[:, 0], p)
+
+
+def _poses(folder: Path) -> Path:
+    path = folder / "path.csv"
+    path.write_text("q2,q1\n0.5,0.1\n-0.4,0.2\n")
+    return path
+
+
+def test_same_seed_same_result(call: Any, tmp_path: Path) -> None:
+    plans = [call(*PLAN, "--configurations", "4", "--seed", s, "--json") for s in ("5", "5", "6")]
+    assert plans[0]["configurations"] == plans[1]["configurations"] != plans[2]["configurations"]
+    path = str(tmp_path / "plan.csv")
+    call(*PLAN, "--configurations", "4", "--output", path)
+    data = [call("simulate", "--robot", "kuka_kr270", "--plan", path, "--seed", s) for s in ("5", "5", "6")]
+    assert data[0] == data[1] != data[2]
+
+
+def test_negative_numbers_may_be_joined_by_commas(call: Any) -> None:
+    words = ("--robot", "planar_2r", "--configurations", "2", "--starts", "2", "--json")
+    poses = [
+        call("plan", *words, *pose)["test_poses"]
+        for pose in (("--test-pose", "-0.5,0.2"), ("--test-pose", "-0.5 0.2"), ("--test-pose=-.5 .2",))
+    ]
+    assert poses == [[[-0.5, 0.2]]] * 3
+
+
+def test_tables_for_people(call: Any, tmp_path: Path) -> None:
+    path = str(tmp_path / "plan.csv")
+    shown = call(*PLAN, "--configurations", "4", "--output", path)
+    assert all(word in shown for word in ("ok:", "ρ0", "µm", "efficiency", "joint_a1", "[°]", "1×"))
+    data = str(tmp_path / "m.csv")
+    assert "mrad" in call("simulate", "--robot", "kuka_kr270", "--plan", path, "--output", data)
+    shown = call("identify", "--robot", "kuka_kr270", "--data", data)
+    assert all(word in shown for word in ("ok:", "before", "± std", "mm", "mrad", "d1", "q5"))
+    shown = call("robots", "show", "kuka_kr270")
+    assert all(word in shown for word in ("joint_a6", "185.00", "lengths+offsets", "target_1.x"))
+
+
+def test_robots(call: Any) -> None:
+    assert [r["name"] for r in call("robots", "--json")["robots"]] == ["kuka_kr270", "planar_2r"]
+    assert call("robots", "list", "--json") == call("robots", "--json")
+    shown = call("robots", "show", "planar_2r", "--json")
+    assert shown["joint_names"] == ["q1", "q2"] and shown["levels"]["lengths"] == ["l1", "l2"]
+    assert {"name": "l1", "unit": "m", "nominal": 1.0} in shown["available_parameters"]
+
+
+def test_demo(call: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "report"
+    result = call("demo", "--json", "--output", str(folder))
+    keys = "before after predicted_accuracy random_after random_predicted_accuracy parameters report"
+    assert result.keys() >= set(keys.split())
+    assert result["parameters"][0].keys() >= {"name", "unit", "true", "value", "std"}
+    assert result["before"] > 10 * result["after"] and result["after"] < 4 * result["predicted_accuracy"]
+    for row in result["parameters"]:
+        assert abs(row["value"] - row["true"]) < 4 * row["std"]
+    names = ["demo.json", "demo.png", "estimate.yaml", "measurements.csv", "plan.yaml"]
+    assert sorted(p.name for p in folder.iterdir()) == names
+    assert json.loads((folder / "demo.json").read_text()) == result
+
+
+@pytest.mark.parametrize("command", ["plan", "identify", "simulate", "robots", "demo"])
+def test_help_has_units_and_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"calib-planner {command}" in out.split("Example:")[1]
+    assert "--json" in out and "--seed" in out
+    if command not in ("robots",):
+        assert "[m]" in out
+
+
+def test_module_version_and_closed_pipe() -> None:
+    run = [sys.executable, "-m", "calib_planner"]
+    assert __version__ in subprocess.run([*run, "--version"], capture_output=True, text=True).stdout
+    process = subprocess.Popen([*run, "robots", "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout and process.stderr
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 141
+
+
+def test_interrupt(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("calib_planner.cli.plan"), "find_plan", interrupted)
+    assert main([*PLAN, "--configurations", "4"]) == 130
+    assert capsys.readouterr().err == "calib-planner plan: interrupted\n"
+
+
+# ── real data ────────────────────────────────────────────────────────────────────────────────────────
+
+IRB = SHARED_DATA / "irb120_tracker"
+
+
+@pytest.mark.skipif(not IRB.is_dir(), reason="the measured data are not here")
+@pytest.mark.parametrize(("level", "rank", "most"), [("offsets", 19, 0.48e-3), ("full", 33, 0.33e-3)])
+def test_irb120(call: Any, level: str, rank: int, most: float) -> None:
+    """ABB IRB 120 before a tracker: 40 poses that took no part in the fit."""
+    result = call(
+        "identify", "--robot", str(IRB / "irb120.urdf"), "--data", str(IRB / "calibration.csv"),
+        "--parameters", level, "--unknown", "base,tool", "--validate", str(IRB / "test_1.csv"),
+        "--validate", str(IRB / "test_2.csv"), "--validate-target-from", "1", "--json",
+    )  # fmt: skip
+    assert result["rank"] == rank
+    assert result["validation"]["count"] == 40
+    assert result["validation"]["before_mean"] == pytest.approx(4.9e-3, abs=0.1e-3)
+    assert result["validation"]["mean"] <= most
+
+
+UR10 = SHARED_DATA / "ur10_tracker"
+
+
+@pytest.mark.skipif(not UR10.is_dir(), reason="the measured data are not here")
+def test_ur10(call: Any, tmp_path: Path) -> None:
+    """UR10 before a tracker: 100 rows fitted, 800 others predicted; std and temperature columns."""
+    header, *rows = (UR10 / "random_poses.csv").read_text().splitlines()
+    picked = np.random.default_rng(0).permutation(len(rows))
+    for name, some in (("fit.csv", picked[:100]), ("test.csv", picked[100:900])):
+        (tmp_path / name).write_text("\n".join([header, *(rows[i] for i in some)]))
+    result = call(
+        "identify", "--robot", str(UR10 / "ur10.urdf"), "--data", str(tmp_path / "fit.csv"), "--json",
+        "--parameters", "offsets", "--unknown", "base,tool", "--sigma", "1e-4",
+        "--validate", str(tmp_path / "test.csv"),
+    )  # fmt: skip
+    assert result["validation"]["count"] == 800
+    assert result["validation"]["before_mean"] == pytest.approx(0.91e-3, rel=0.1)
+    assert result["validation"]["mean"] == pytest.approx(0.50e-3, rel=0.1)
