@@ -1,0 +1,119 @@
+"""Nodes as processes of their own, on a ROS domain of their own, that are always ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+from calib_planner.errors import CalibPlannerError
+
+PATIENCE = 8.0
+"""Seconds a process has to end after SIGINT before it is killed."""
+
+
+class ProcessFailed(CalibPlannerError):
+    """A node ended on its own.
+
+    Attributes:
+        name: The node's module.
+        status: Its exit status.
+    """
+
+    def __init__(self, name: str, status: int, last_lines: str) -> None:
+        self.name, self.status = name, status
+        super().__init__(f"{name} ended with status {status}:\n{last_lines}")
+
+
+@dataclass
+class _Child:
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def last_lines(self, count: int = 15) -> str:
+        return "\n".join(self.log.read_text(errors="replace").splitlines()[-count:])
+
+
+def own_domain() -> int:
+    """A domain id that is probably free: ROS allows 0 to 101 without clashing with ephemeral ports."""
+    return 1 + (os.getpid() * 37) % 100
+
+
+class Nodes:
+    """Starts nodes of this package; a context manager that ends them whatever happens.
+
+    Args:
+        folder: Gets a log per node.
+        domain: ROS domain id.
+    """
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self._folder, self._children = folder, list[_Child]()
+        self._environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONUNBUFFERED": "1",
+        }
+
+    def start(self, module: str, parameters: Mapping[str, object] | None = None) -> None:
+        """Start ``calib_planner.ros.MODULE`` with node parameters."""
+        command = [sys.executable, "-m", f"calib_planner.ros.{module}", "--ros-args"]
+        for name, value in (parameters or {}).items():
+            command += ["-p", f"{name}:={value}"]
+        self._folder.mkdir(parents=True, exist_ok=True)
+        log = self._folder / f"{module}.log"
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,  # Ctrl-C reaches them through us, once
+            )
+        self._children.append(_Child(module, process, log))
+
+    def check(self) -> None:
+        """Raise ``ProcessFailed`` if a node has ended."""
+        for child in self._children:
+            status = child.process.poll()
+            if status is not None:
+                raise ProcessFailed(child.name, status, child.last_lines())
+
+    def end(self, number: signal.Signals = signal.SIGINT) -> dict[str, int]:
+        """End all nodes; returns the exit status of each (negative: had to be killed)."""
+        running = [c for c in self._children if c.process.poll() is None]
+        for child in running:
+            child.process.send_signal(number)
+        deadline = time.monotonic() + PATIENCE
+        for child in running:
+            try:
+                child.process.wait(max(deadline - time.monotonic(), 0.01))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+        return {c.name: int(c.process.returncode) for c in self._children}
+
+    def logs(self) -> dict[str, str]:
+        """The last lines of each node's output."""
+        return {c.name: c.last_lines() for c in self._children}
+
+    def __enter__(self) -> Nodes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+
+def node_names() -> Sequence[str]:
+    """Modules of the three nodes."""
+    return ("planner_node", "identifier_node", "simulator_node")

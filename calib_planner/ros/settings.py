@@ -1,0 +1,176 @@
+"""The parameters of the three nodes; ``config/*.yaml`` repeats them for users, a test keeps both equal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.instrument.standstill import StandstillSettings
+from calib_planner.robot.catalogue import shipped_robots
+from calib_planner.robot.chain import Robot
+from calib_planner.ros.parameters import parameter
+
+ROBOT = "shipped robot name"
+LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas"
+
+
+@dataclass(frozen=True)
+class PlannerParameters:
+    """Parameters of ``calibration_planner``."""
+
+    robot: str = parameter("kuka_kr270", ROBOT, read_only=True)
+    parameters: str = parameter("lengths+offsets", LEVEL)
+    unknown: str = parameter("", "what else is unknown: base, tool or base,tool")
+    criterion: str = parameter("test_pose", "what is optimised, unless the request says otherwise")
+    configurations: int = parameter(
+        12, "configurations of a plan, unless the request says", low=1, high=10000
+    )
+    repetitions: int = parameter(1, "measurements at each configuration", low=1, high=10000)
+    sigma: float = parameter(3e-5, "noise of one measured coordinate", unit="m", low=1e-9, high=1.0)
+    starts: int = parameter(64, "random starts of the search", low=1, high=100000)
+    time_limit: float = parameter(60.0, "longest search", unit="s", low=0.01, high=86400.0)
+    most_configurations: int = parameter(200, "largest plan that is accepted", low=1, high=10000)
+    most_test_poses: int = parameter(1000, "most test poses that are accepted", low=1, high=100000)
+    joint_speed: float = parameter(1.0, "joint speed of ~/trajectory", unit="rad/s", low=1e-3, high=100.0)
+    frame_id: str = parameter("base_link", "frame of the robot's base")
+
+
+@dataclass(frozen=True)
+class IdentifierParameters:
+    """Parameters of ``calibration_identifier``; the standstill's are those of ``StandstillSettings``."""
+
+    robot: str = parameter("kuka_kr270", ROBOT, read_only=True)
+    parameters: str = parameter("", LEVEL + "; empty = those of the plan", read_only=True)
+    unknown: str = parameter("", "what else is unknown: base, tool or base,tool", read_only=True)
+    sigma: float = parameter(
+        3e-5, "noise of one coordinate of one tracker point; 0 = from their scatter", unit="m", low=0, high=1
+    )
+    repeatability: float = parameter(
+        0.0, "noise that averaging does not reduce (robot, reflector)", unit="m", low=0.0, high=1.0
+    )
+    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", read_only=True)
+    plan_topic: str = parameter(
+        "calibration_planner/current_plan", "where the plan comes from", read_only=True
+    )
+    plan_tolerance: float = parameter(
+        0.01, "largest joint difference to a planned configuration", unit="rad or m", low=1e-6, high=1.0
+    )
+    accept_unplanned: bool = parameter(False, "use standstills that are in no plan")
+    most_measurements: int = parameter(5000, "measurements kept at most", low=1, high=1000000)
+    save_folder: str = parameter("", "folder for ~/save; empty = saving is off", read_only=True)
+    joint_tolerance: float = parameter(
+        1e-4, "standstill: largest range of a joint", unit="rad or m", low=1e-9, high=1.0, read_only=True
+    )
+    point_tolerance: float = parameter(
+        3e-4,
+        "standstill: largest range of a coordinate, about ten times sigma",
+        unit="m",
+        low=1e-7,
+        high=1.0,
+        read_only=True,
+    )
+    settle: float = parameter(
+        0.1, "standstill: left out after the joints rest", unit="s", low=0.0, high=60.0, read_only=True
+    )
+    duration: float = parameter(
+        0.4, "standstill: shortest interval averaged", unit="s", low=0.01, high=600.0, read_only=True
+    )
+    samples: int = parameter(
+        20, "standstill: points of every target wanted", low=1, high=20000, read_only=True
+    )
+    minimum_samples: int = parameter(
+        5, "standstill: points of a target needed to use it", low=1, high=20000, read_only=True
+    )
+    patience: float = parameter(
+        2.0, "standstill: after this take what there is", unit="s", low=0.01, high=600.0, read_only=True
+    )
+    gap: float = parameter(
+        0.25, "standstill: longest pause within a stream", unit="s", low=1e-3, high=60.0, read_only=True
+    )
+    window: float = parameter(
+        0.1, "standstill: how late a message may come", unit="s", low=0.0, high=60.0, read_only=True
+    )
+    skew: float = parameter(
+        0.5,
+        "standstill: largest difference of the streams' stamps",
+        unit="s",
+        low=1e-3,
+        high=60.0,
+        read_only=True,
+    )
+
+    def __post_init__(self) -> None:
+        _ = self.standstill
+        if not self.tracker_topics or not all(self.tracker_topics):
+            raise InputError("tracker_topics", self.tracker_topics, "one topic name per target")
+
+    @property
+    def standstill(self) -> StandstillSettings:
+        """The part that decides what a standstill is."""
+        return StandstillSettings(**{f.name: getattr(self, f.name) for f in fields(StandstillSettings)})
+
+
+@dataclass(frozen=True)
+class SimulatorParameters:
+    """Parameters of ``tracker_simulator``."""
+
+    robot: str = parameter("kuka_kr270", ROBOT, read_only=True)
+    parameters: str = parameter("lengths+offsets", "which have true errors: a level or names", read_only=True)
+    seed: int = parameter(0, "seed of the true errors and the noise", low=0, high=2**31 - 1, read_only=True)
+    length_error: float = parameter(
+        1e-3, "standard deviation of the true errors of lengths", unit="m", low=0.0, high=1.0, read_only=True
+    )
+    angle_error: float = parameter(
+        1e-3, "standard deviation of the true errors of angles", unit="rad", low=0.0, high=1.0, read_only=True
+    )
+    true_deviations: str = parameter(
+        "", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]", read_only=True
+    )
+    sigma: float = parameter(3e-5, "noise of one coordinate of a tracker point", unit="m", low=0.0, high=1.0)
+    joint_rate: float = parameter(
+        100.0, "rate of joint_states", unit="Hz", low=1.0, high=1000.0, read_only=True
+    )
+    tracker_rate: float = parameter(
+        50.0, "rate of tracker points", unit="Hz", low=0.1, high=1000.0, read_only=True
+    )
+    joint_speed: float = parameter(6.0, "largest joint speed", unit="rad/s", low=1e-3, high=100.0)
+    dwell: float = parameter(0.8, "standing still per measurement", unit="s", low=0.0, high=600.0)
+    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", read_only=True)
+    frame_id: str = parameter("tracker", "frame of the tracker's points", read_only=True)
+
+    def deviations(self, names: Sequence[str]) -> dict[str, float]:
+        """``true_deviations`` by parameter name; refuses names not in ``names`` and values not finite."""
+        result = {}
+        for word in filter(None, (w.strip() for w in self.true_deviations.split(","))):
+            name, _, text = word.partition("=")
+            if name.strip() not in names:
+                raise UnknownNameError("true_deviations", name.strip(), names)
+            try:
+                value = float(text)
+            except ValueError:
+                value = float("nan")
+            if not np.isfinite(value):
+                raise InputError("true_deviations", word, "name=number with commas between")
+            result[name.strip()] = value
+        return result
+
+
+def load_shipped(name: str, parameters: str, unknown: str = "", targets: int | None = None) -> Robot:
+    """A shipped robot with active parameters; other sources are refused, since names may come from anyone.
+
+    Args:
+        targets: Number of targets; more than the robot has are at the tip, with ``tool`` unknown.
+    """
+    if name not in shipped_robots():
+        raise UnknownNameError("robot", name, shipped_robots())
+    robot = Robot.load(name)
+    words = [w.strip() for w in unknown.split(",") if w.strip()]
+    if targets is not None and targets != len(robot.targets):
+        if "tool" not in words:
+            expected = f"{len(robot.targets)} topics, as the robot has targets"
+            raise InputError("tracker_topics", f"{targets} topics", expected, "or set unknown to tool")
+        robot = robot.with_targets(np.zeros((targets, 3)))
+    return robot.with_parameters(parameters, words)
