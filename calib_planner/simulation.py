@@ -23,7 +23,7 @@ def random_deviations(
     robot: Robot, seed: int, length: float = LENGTH_ERROR, angle: float = ANGLE_ERROR
 ) -> dict[str, float]:
     """True errors of the active parameters, drawn from normal distributions [m | rad]."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, 1])  # a stream of its own: noise may have the same seed
     draw = rng.standard_normal(len(robot.parameters))
     return {
         p.name: float(d * (length if p.unit == "m" else angle))

@@ -1,18 +1,16 @@
-"""How good could any plan be? A lower bound from the relaxed problem and the equivalence theorem.
+"""How good could any plan be? An upper bound on its worth from the relaxed problem.
 
-Relax "m configurations, each counted once" to a probability measure ξ on configurations, with the
-information per measurement M(ξ) = Σ w_k I(q_k), I(q) = J(q)ᵀJ(q). φ(M) = trace(A M⁻¹) is convex and
-φ(cM) = φ(M)/c. For any nonsingular M, with the sensitivity
+Relax "n measurements, each at one configuration" to a probability measure ξ, with M(ξ) = M_0 + n Σ w_k I_1(q_k).
+By (B) of ``criteria``, for any M with slope G and sensitivity d(q) = tr(G I_1(q)),
 
-    d(q) = trace(A M⁻¹ I(q) M⁻¹),        d_max = max_q d(q),
+    Ψ(M*) ≤ tr(G M*) ≤ tr(G M_0) + n max_q d(q)          for every plan M* of n measurements,
 
-convexity at c·M gives φ(M*) ≥ 2φ/c − d(M*)/c², at most d_max in place of d(M*); the best c = d_max/φ yields
+whatever its configurations and repetitions: n measurements with σ_c count at most as n at different places.
+That is the equivalence theorem; it is tight at the optimal measure. For eq. (14) it reads
+ρ0² ≥ φ²/d_max with φ = tr(A M⁻¹) and d = tr(A M⁻¹ I M⁻¹).
 
-    φ(M*) ≥ φ(M)² / d_max        for every measure, hence  m ρ0²/σ² ≥ φ² / d_max  for every plan of m
-                                 measurements.
-
-The measure improves by alternating multiplicative updates w ← w·√(d/φ) (monotone for linear criteria) with
-adding maxima of d. The bound is as good as the maximisation of d: by search it is "numerical".
+The measure improves by alternating multiplicative updates w_k ← w_k √(d_k / mean) with adding maxima of d. The
+bound is as good as the maximisation of d: by search it is "numerical".
 """
 
 from __future__ import annotations
@@ -23,8 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_planner._arrays import FloatArray
-from calib_planner.design.search.descent import descend
-from calib_planner.robot.chain import Robot
+from calib_planner.design.criteria import Criterion
+from calib_planner.design.feasibility import Feasibility
+from calib_planner.design.information import InformationModel
+from calib_planner.design.search.descent import Descent, descend
 
 SPREAD = 256
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
@@ -33,26 +33,48 @@ it keeps M invertible and d smooth, and costs the bound about its weight times t
 plan."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class RelaxedProblem:
+    """What the measure is to be best for.
+
+    Attributes:
+        model: Information of one measurement (repetitions = 1).
+        criterion: A concave criterion.
+        prior: (p, p) M_0.
+        measurements: n.
+        feasibility: Where measuring is possible.
+        pool: (C, joints) the only configurations there are, or ``None`` for all within the limits.
+    """
+
+    model: InformationModel
+    criterion: Criterion
+    prior: FloatArray
+    measurements: int
+    feasibility: Feasibility
+    pool: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class RelaxedDesign:
     """The relaxed optimum, as far as found.
 
     Attributes:
-        value: φ of the best measure found (per measurement, σ = 1): no plan needs to be expected below it.
-        bound: φ²/d_max, the largest found: no plan is below it if d was maximised globally.
+        worth: Ψ of the best measure found.
+        bound: Smallest upper bound found on Ψ of any plan; numerical until proven.
         support: (K, joints) configurations of the measure.
         weights: (K,) their weights.
+        slope: (p, p) G that gave the bound.
     """
 
-    value: float
+    worth: float
     bound: float
     support: FloatArray
     weights: FloatArray
+    slope: FloatArray
 
 
 def relaxed_design(
-    robot: Robot,
-    weight: FloatArray,
+    problem: RelaxedProblem,
     start: FloatArray,
     rng: np.random.Generator,
     stop: Callable[[], bool] = lambda: False,
@@ -60,29 +82,25 @@ def relaxed_design(
     rounds: int = 60,
     gap: float = 3e-3,
 ) -> RelaxedDesign:
-    """Solve the relaxed problem by growing a discrete measure.
-
-    Args:
-        weight: (P, P) matrix A of the criterion.
-        start: (K, joints) configurations to begin with, e.g. those of good plans.
-        gap: Ends when bound ≥ (1 − gap)·value.
-    """
-    low, high = robot.joint_limits.T
-    everywhere = _unit_information(robot, rng.uniform(low, high, (SPREAD, len(low)))).mean(axis=0)
-    support: FloatArray = start
-    weights: FloatArray = np.full(len(start), 1.0 / len(start))
-    best_value, best_bound, best = np.inf, 0.0, (support, weights)
+    """Grow a discrete measure until the bound is within ``gap`` of its worth."""
+    if problem.pool is not None:
+        return _relaxed_pool(problem, problem.pool)
+    model, n = problem.model, problem.measurements
+    everywhere = model.at(problem.feasibility.sample(rng, SPREAD)).mean(axis=0)
+    support: FloatArray = np.concatenate([start, problem.feasibility.sample(rng, 16)])
+    weights: FloatArray = np.full(len(support), 1.0 / len(support))
+    best: RelaxedDesign | None = None
     for step in range(rounds):
         floor = max(FIRST_FLOOR * 0.7**step, LAST_FLOOR)
-        unit = _unit_information(robot, support)
-        weights, value, slope = _multiplicative(unit, weight, weights, floor * everywhere, floor)
-        probes = _probes(robot, slope, support[np.argsort(-weights)[:10]], rng)
-        peaks = descend(_sensitivity(robot, slope), probes, low, high, iterations=40, tolerance=1e-4)
-        largest = float(np.exp(-peaks.value.min()))
-        if value < best_value:
-            best_value, best = value, (support, weights)
-        best_bound = max(best_bound, min(value * value / largest, value))
-        if best_bound >= (1.0 - gap) * best_value or stop():
+        ground = problem.prior + n * floor * everywhere
+        unit = n * (1.0 - floor) * model.at(support)
+        weights, matrix = _multiplicative(problem.criterion, unit, weights, ground)
+        slope = problem.criterion.supporting_slope(matrix)
+        peaks = maximise_sensitivity(problem, slope, _probes(problem, slope, support, weights, rng))
+        worth = problem.criterion.exact(matrix)
+        ceiling = float(np.sum(slope * problem.prior)) + n * float(np.exp(-peaks.value.min()))
+        best = _better(best, RelaxedDesign(worth, max(ceiling, worth), support, weights, slope))
+        if best.worth >= (1.0 - gap) * best.bound or stop():
             break
         new = peaks.x[np.argsort(peaks.value)[:6]]
         keep = weights > 1e-6
@@ -90,57 +108,90 @@ def relaxed_design(
         support = np.concatenate([support[keep], new])
         weights = np.concatenate([weights[keep], np.full(len(new), share / len(new))])
         weights /= weights.sum()
-    return RelaxedDesign(best_value, best_bound, *best)
+    assert best is not None
+    return best
 
 
-def _probes(robot: Robot, slope: FloatArray, known: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _relaxed_pool(problem: RelaxedProblem, pool: FloatArray, gap: float = 2e-3) -> RelaxedDesign:
+    """The same over a finite pool: every d is computed, so the bound is exact."""
+    q = pool[problem.feasibility.mask(pool)]
+    unit = problem.measurements * problem.model.at(q)
+    weights: FloatArray = np.full(len(q), 1.0 / len(q))
+    best: RelaxedDesign | None = None
+    for _ in range(30):
+        weights, matrix = _multiplicative(problem.criterion, unit, weights, problem.prior, 20)
+        slope = problem.criterion.supporting_slope(matrix)
+        worth = problem.criterion.exact(matrix)
+        ceiling = float(np.sum(slope * problem.prior))
+        ceiling += float((unit.reshape(len(unit), -1) @ slope.ravel()).max())
+        best = _better(best, RelaxedDesign(worth, max(ceiling, worth), q, weights, slope))
+        if best.worth >= (1.0 - gap) * best.bound:
+            break
+    assert best is not None
+    return best
+
+
+def _better(best: RelaxedDesign | None, new: RelaxedDesign) -> RelaxedDesign:
+    """The best measure and the best bound seen so far, which need not come from the same round."""
+    if best is None:
+        return new
+    top = new if new.worth > best.worth else best
+    low = new if new.bound < best.bound else best
+    return RelaxedDesign(top.worth, max(low.bound, top.worth), top.support, top.weights, low.slope)
+
+
+def _probes(
+    problem: RelaxedProblem,
+    slope: FloatArray,
+    support: FloatArray,
+    weights: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
     """Starts for the maximisation of d: the support, and the best of many random configurations."""
-    low, high = robot.joint_limits.T
-    random = rng.uniform(low, high, (512, len(low)))
-    jacobian = robot.jacobian(random)
-    height = np.einsum("nij,jk,nik->n", jacobian, slope, jacobian, optimize=True)
+    known = support[np.argsort(-weights)[:10]]
+    random = problem.feasibility.sample(rng, 512)
+    height = np.einsum("nab,ab->n", problem.model.at(random), slope)
     return np.concatenate([known, random[np.argsort(-height)[:14]]])
 
 
-def _unit_information(robot: Robot, q: FloatArray) -> FloatArray:
-    """I(q) = J(q)ᵀJ(q), shape (K, P, P)."""
-    jacobian = robot.jacobian(q)
-    return np.einsum("kia,kib->kab", jacobian, jacobian)
-
-
 def _multiplicative(
-    unit: FloatArray,
-    weight: FloatArray,
-    w: FloatArray,
-    ground: FloatArray,
-    floor: float,
-    iterations: int = 100,
-) -> tuple[FloatArray, float, FloatArray]:
-    """Improve the weights; returns them, φ, and B = M⁻¹AM⁻¹ (so that d(q) = trace(J B Jᵀ))."""
+    criterion: Criterion, unit: FloatArray, w: FloatArray, ground: FloatArray, iterations: int = 100
+) -> tuple[FloatArray, FloatArray]:
+    """Improve the weights of ``unit`` (K, p, p); returns them and M.
+
+    The exponent ½ is monotone for traces; sharper criteria (worst case, smallest eigenvalue) overshoot with it,
+    so it is halved whenever the worth falls.
+    """
     flat = unit.reshape(len(unit), -1)
-    size = unit.shape[1]
-    for step in range(iterations + 1):
-        inverse = np.linalg.inv((1.0 - floor) * (w @ flat).reshape(size, size) + ground)
-        half = inverse @ weight
-        slope, value = half @ inverse, float(np.trace(half))
-        if step < iterations:
-            d = np.maximum(flat @ slope.ravel(), 0.0)
-            w = w * np.sqrt(d / value)
-            w = w / w.sum()
-    return w, value, (slope + slope.T) / 2
+    matrix = (w @ flat).reshape(ground.shape) + ground
+    worth, slope = (part[0] for part in criterion.worth_and_slope(matrix[None]))
+    exponent = 0.5
+    for _ in range(iterations):
+        d = np.maximum(flat @ slope.ravel(), 1e-300)
+        trial = w * (d / (w @ d)) ** exponent
+        trial = trial / trial.sum()
+        moved = (trial @ flat).reshape(ground.shape) + ground
+        new_worth, new_slope = (part[0] for part in criterion.worth_and_slope(moved[None]))
+        if new_worth >= worth * (1.0 - 1e-12):
+            w, matrix, worth, slope = trial, moved, new_worth, new_slope
+            exponent = min(1.1 * exponent, 0.5)
+        elif exponent > 1e-3:
+            exponent *= 0.5
+        else:
+            break
+    return w, matrix
 
 
-def _sensitivity(robot: Robot, slope: FloatArray):  # type: ignore[no-untyped-def]
-    """−log d(q) and its gradient, for ``descend``."""
-    targets, parameters = len(robot.targets), len(slope)
-    zero = np.zeros(parameters)
+def maximise_sensitivity(problem: RelaxedProblem, slope: FloatArray, starts: FloatArray) -> Descent:
+    """Local maxima of d(q) over the feasible configurations, as minima of −log d."""
+    low, high = problem.model.robot.joint_limits.T
+    constrained = bool(problem.feasibility.constraints)
 
     def objective(q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        lin = robot._linearise(q, zero)
-        jacobian = lin.jacobian()
-        pull = jacobian @ slope
-        d = np.maximum(np.einsum("nij,nij->n", pull, jacobian), 1e-300)
-        weights = (-2.0 * pull / d[:, None, None]).transpose(2, 1, 0)
-        return -np.log(d), lin.pull_back(weights.reshape(parameters, targets, 3, len(q)))
+        info = problem.model.linearised(q)
+        d = np.einsum("nip,nip->n", info.jacobian @ slope, info.weighted)
+        d = np.maximum(d, 1e-300)
+        value = np.where(problem.feasibility.mask(q), -np.log(d), np.inf) if constrained else -np.log(d)
+        return value, info.gradient(-slope / d[:, None, None])
 
-    return objective
+    return descend(objective, starts, low, high, iterations=40, tolerance=1e-4)

@@ -1,26 +1,116 @@
-"""What a set of configurations tells about the parameters: the information matrix of eq. (10) and (11).
+"""What a set of configurations tells about the parameters: the information matrix of eqs. (10) and (11).
 
-    M = Σ_i r_i · J_iᵀ J_i / σ²,        cov(Π̂) = M⁻¹
+Measuring configuration q r times gives, with the point covariance Σ(p) of the instrument and an error of the
+configuration itself that repetition does not average away (robot repeatability, standard deviation σ_c),
 
-with r_i repetitions at configuration i and the standard deviation σ of one coordinate of one point. All
-matrices here are for σ = 1; whoever reports metres multiplies by σ.
+    I(q) = J(q)ᵀ W(q) J(q),      W = (Σ(p(q))/r + σ_c² I)⁻¹  per target,
+    M = M_0 + Σ_i I(q_i),        cov(Π̂) = M⁻¹,
+
+M_0 being what is known beforehand (prior standard deviations, earlier measurements). For Σ = σ² I, σ_c = 0 and
+M_0 = 0 this is eq. (11). All matrices are in physical units, 1/(parameter unit)².
+
+Gradient. For ψ(M) with slope G, dψ = Σ_i tr(G dI(q_i)) and
+
+    tr(G dI) = 2 tr(G Jᵀ W dJ) − tr(K dΣ)/r,     K = W J G Jᵀ W  per target:
+
+the first term goes back to the joints by ``Linearisation.pull_back``, the second by ∂Σ/∂p and ∂p/∂q.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from calib_planner._arrays import FloatArray
+from calib_planner.instrument.noise import Isotropic, Noise, covariance_gradient
+from calib_planner.robot.chain import Robot
+from calib_planner.robot.linearisation import Linearisation
 
 RANK_TOLERANCE = 1e-9
 """Eigenvalues of a scaled information matrix below this share of the largest count as zero."""
 
 
-def information(jacobians: FloatArray, repetitions: FloatArray) -> FloatArray:
-    """M for σ = 1: ``jacobians`` (m, 3·targets, P), ``repetitions`` (m,); returns (P, P)."""
-    weighted = jacobians * np.sqrt(repetitions)[:, None, None]
-    stacked = weighted.reshape(-1, jacobians.shape[-1])
-    return stacked.T @ stacked
+@dataclass(frozen=True, eq=False)
+class InformationModel:
+    """How configurations turn into information.
+
+    Attributes:
+        robot: Its active parameters are the order of all matrices.
+        noise: Covariance of one measured point.
+        configuration_sigma: σ_c [m].
+        repetitions: r, measurements at each configuration.
+    """
+
+    robot: Robot
+    noise: Noise
+    configuration_sigma: float = 0.0
+    repetitions: int = 1
+
+    def at(self, q: FloatArray) -> FloatArray:
+        """I(q) of each configuration: (N, joints) → (N, p, p)."""
+        points, jacobian = self.robot.positions_and_jacobian(q)
+        jacobian = np.ascontiguousarray(jacobian)
+        return np.swapaxes(jacobian, 1, 2) @ self._weigh(points, jacobian)
+
+    def linearised(self, q: FloatArray) -> LinearisedInformation:
+        """The same with what its gradient needs."""
+        lin = self.robot._linearise(q, np.zeros(len(self.robot.parameter_names)))
+        jacobian = lin.jacobian()
+        weighted = self._weigh(lin.points.transpose(2, 0, 1), jacobian)
+        return LinearisedInformation(self, lin, jacobian, weighted)
+
+    def _weigh(self, points: FloatArray, jacobian: FloatArray) -> FloatArray:
+        """W J, (N, 3·targets, p)."""
+        if isinstance(self.noise, Isotropic):
+            variance = self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2
+            return jacobian / variance
+        blocks = jacobian.reshape(*points.shape, -1)
+        return (np.linalg.inv(self._covariance(points)) @ blocks).reshape(jacobian.shape)
+
+    def _covariance(self, points: FloatArray) -> FloatArray:
+        common = self.configuration_sigma**2 * np.eye(3)
+        return self.noise.covariance(points) / self.repetitions + common
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedInformation:
+    """I(q) at a batch of configurations, ready to be differentiated.
+
+    Attributes:
+        model: Where it comes from.
+        lin: The chain's linearisation.
+        jacobian: (N, 3·targets, p) J.
+        weighted: (N, 3·targets, p) W J.
+    """
+
+    model: InformationModel
+    lin: Linearisation
+    jacobian: FloatArray
+    weighted: FloatArray
+
+    def sums(self, size: int) -> FloatArray:
+        """Σ I over each run of ``size`` configurations: (N/size, p, p)."""
+        rows, p = size * self.jacobian.shape[1], self.jacobian.shape[2]
+        left = self.jacobian.reshape(-1, rows, p)
+        return np.swapaxes(left, 1, 2) @ self.weighted.reshape(-1, rows, p)
+
+    def gradient(self, slopes: FloatArray) -> FloatArray:
+        """∂ψ/∂q (N, joints) for slopes G: (N/size, p, p), each serving a run of ``size`` configurations."""
+        n, rows, p = self.jacobian.shape
+        targets = rows // 3
+        size = n // len(slopes)
+        pull = (self.weighted.reshape(len(slopes), size * rows, p) @ slopes).reshape(n, rows, p)
+        weights = 2.0 * pull.transpose(2, 1, 0)
+        gradient = self.lin.pull_back(weights.reshape(p, targets, 3, n))
+        noise = self.model.noise
+        if isinstance(noise, Isotropic):
+            return gradient
+        points = self.lin.points.transpose(2, 0, 1)
+        blocks = pull.reshape(n, targets, 3, p) @ np.swapaxes(self.weighted.reshape(n, targets, 3, p), -1, -2)
+        slope = covariance_gradient(noise, points) / self.model.repetitions
+        force = -np.einsum("ntij,ntijx->ntx", blocks, slope)
+        return gradient + np.einsum("ntx,jtxn->nj", force, self.lin.joint_columns)
 
 
 def covariance(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -29,7 +119,7 @@ def covariance(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     Scaled to unit diagonal first, so that the rank does not depend on the units of the parameters.
 
     Returns:
-        (P, P) pseudo-inverse, and (P, P − rank) directions that the data cannot see (unit columns).
+        (p, p) pseudo-inverse, and (p, p − rank) directions that the data cannot see (unit columns).
     """
     diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     scale = np.where(diagonal > 0, diagonal, 1.0)
@@ -43,7 +133,7 @@ def covariance(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def error_variance(test_jacobian: FloatArray, matrix: FloatArray) -> float:
-    """ρ0²/σ² of eq. (14) for J0 (3·targets, P): infinite if J0 needs what the plan cannot see.
+    """ρ0² of eq. (14) for J0 (3·targets, p): infinite if J0 needs what the plan cannot see.
 
     With several targets, the mean over the targets of the squared distance.
     """

@@ -32,16 +32,19 @@ class Plan:
         repetitions: (m,) measurements at each.
         test_poses: (K, joints) [rad | m].
         weights: (K,) weights of the test poses.
-        sigma: Standard deviation of one coordinate [m].
+        sigma: Standard deviation of one coordinate [m]; for a laser tracker a typical one.
         predicted_accuracy: ρ0 of eq. (14), root mean square over the test poses [m].
         predicted_accuracy_per_test_pose: (K,) [m].
         parameter_std: (P,) predicted standard deviation of each parameter [m | rad]; infinite if this plan
             does not see it, NaN if no plan can tell it from others.
         unidentifiable: Combinations of parameters that no configuration within the limits can tell apart.
         general_accuracy: Root mean square error over random configurations within the limits [m].
-        lower_bound: No plan with as many measurements has a smaller ρ0 [m].
-        efficiency: lower_bound / predicted_accuracy, at most 1.
-        bound: ``"numerical"`` (the sensitivity was maximised by search) or ``"proven"``.
+        value: Value of the criterion, see ``criteria``; for ``test_pose`` the predicted accuracy.
+        value_bound: No plan with as many measurements has a better value; NaN where the criterion has no bound.
+        lower_bound: The same in metres for criteria that are accuracies, NaN for others.
+        efficiency: Value over bound in the criterion's own convention, at most 1: for accuracies
+            lower_bound / value, for D (det M / det M*)^(1/p).
+        bound: ``"numerical"`` (the sensitivity was maximised by search), ``"proven"``, or ``"none"``.
         status: A key of ``STATUS``.
         message: What it means and what to do.
         seconds: Time spent.
@@ -64,6 +67,8 @@ class Plan:
     parameter_std: FloatArray
     unidentifiable: tuple[str, ...]
     general_accuracy: float
+    value: float
+    value_bound: float
     lower_bound: float
     efficiency: float
     bound: str

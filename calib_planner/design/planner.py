@@ -1,22 +1,36 @@
-"""The verb: ``plan(problem)`` → ``Plan``. Search, polish, order, bound."""
+"""The verb: ``plan(problem)`` → ``Plan``. Prepare, relax, search, prove what was reached.
+
+The relaxed problem comes first: its optimum is the bound, and its support is where good plans are. Then the
+search, in ``CHUNKS`` independent parts that any ``concurrent.futures`` executor may do. Compound criteria are
+geometric means of efficiencies, so their parts' relaxed optima are found before them.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_planner._arrays import FloatArray
-from calib_planner.design.bound import relaxed_design
-from calib_planner.design.criteria import LinearCriterion, accuracy_weight
-from calib_planner.design.identifiability import Identifiability, analyse
-from calib_planner.design.information import covariance, error_variance, information
+from calib_planner.design.bound import RelaxedDesign, RelaxedProblem, relaxed_design
+from calib_planner.design.criteria import (
+    Compound,
+    Criterion,
+    efficiency,
+    reported_value,
+)
+from calib_planner.design.information import covariance, error_variance
+from calib_planner.design.order import visiting_order
 from calib_planner.design.plan import STATUS, Plan
-from calib_planner.design.problem import SAMPLE, PlanProblem, reachable_sample
-from calib_planner.design.search.multistart import SearchResult, search
-from calib_planner.robot.chain import Robot
+from calib_planner.design.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.design.search.exchange import PoolProblem, choose
+from calib_planner.design.search.multistart import CHUNKS, SearchProblem, SearchResult, search_chunk
+from calib_planner.design.space import PlanSpace, plan_space
+
+__all__ = ["Progress", "plan"]
 
 
 @dataclass(frozen=True)
@@ -25,8 +39,8 @@ class Progress:
 
     Attributes:
         starts_done, starts_total: Descents finished and asked for.
-        best_accuracy: Best ρ0 so far [m]; infinite before the first.
-        lower_bound: Bound so far [m]; 0 before it is known.
+        best_accuracy: Best value of the criterion so far (ρ0 [m] for test poses); NaN before the first.
+        lower_bound: Bound on that value; NaN before it is known.
         seconds: Time spent.
     """
 
@@ -37,115 +51,183 @@ class Progress:
     seconds: float
 
 
-def plan(problem: PlanProblem, callback: Callable[[Progress], bool | None] | None = None) -> Plan:
+Callback = Callable[[Progress], bool | None]
+
+
+def plan(problem: PlanProblem, callback: Callback | None = None, executor: Executor | None = None) -> Plan:
     """Find the best configurations, and a bound on how good any could be.
 
     Args:
         problem: What is asked.
         callback: Told of progress; returning ``True`` cancels, the best plan so far being returned.
+        executor: Any ``concurrent.futures`` executor; the plan is the same whichever, or without one. With
+            one, time limit and cancellation act between the parts of the work.
+
+    Raises:
+        InfeasibleError: Nothing satisfies the problem; names what stands in the way.
     """
-    clock = _Clock(problem, callback)
-    rng = np.random.default_rng(problem.seed)
-    space = _space(problem)
-    share = problem.general_weight
-    criterion = LinearCriterion((1.0 - share) * space.weight + share * space.general)
-    robot, size = space.robot, problem.configurations
-    found = search(robot, criterion, size, problem.starts, rng, clock.stop, clock.starts)
-    bound = _bound(problem, space, found, rng, clock)
-    return _assemble(problem, space, found, bound, clock)
+    space = plan_space(problem)
+    clock = _Clock(problem, len(space.interest), callback)
+    seeds = np.random.SeedSequence(problem.seed).spawn(CHUNKS + 1)
+    criterion, target = _criteria(space, np.random.default_rng(seeds[CHUNKS]))
+    rng = np.random.default_rng(seeds[CHUNKS])
+    relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
+    clock.tell(bound=relaxed.bound if relaxed else None)
+    if problem.candidates is not None:
+        found = _choose(space, criterion, rng, clock)
+    else:
+        found = _search(space, criterion, relaxed, seeds[:CHUNKS], clock, executor)
+    return _assemble(space, target, relaxed, found, clock)
 
 
-@dataclass(frozen=True)
-class _Space:
-    """The problem in parameters that some plan can tell apart.
-
-    Attributes:
-        robot: The robot, active in those parameters only.
-        identifiability: Which of the problem's parameters those are.
-        test_jacobians: (K, 3·targets, r) at the test poses.
-        weight: (r, r) matrix A of eq. (14).
-        general: (r, r) the same for the whole workspace.
-    """
-
-    robot: Robot
-    identifiability: Identifiability
-    test_jacobians: FloatArray
-    weight: FloatArray
-    general: FloatArray
-
-
-def _space(problem: PlanProblem) -> _Space:
-    names = problem.robot.parameter_names
-    sample = reachable_sample(problem.robot, SAMPLE)
-    found = analyse(sample.reshape(-1, len(names)), names)
-    kept = sorted(found.kept)
-    robot = problem.robot.with_parameters([names[i] for i in kept])
-    tests = robot.jacobian(problem.test_pose_array)
-    return _Space(
-        robot=robot,
-        identifiability=found,
-        test_jacobians=tests,
-        weight=accuracy_weight(tests, problem.weight_array),
-        general=accuracy_weight(sample[:, :, kept], np.ones(len(sample))),
-    )
+# ── the parts ────────────────────────────────────────────────────────────────────────────────────────
 
 
 class _Clock:
     """Time limit, cancellation and progress in one place."""
 
-    def __init__(self, problem: PlanProblem, callback: Callable[[Progress], bool | None] | None) -> None:
+    def __init__(self, problem: PlanProblem, size: int, callback: Callback | None) -> None:
         self.began = time.perf_counter()
         self.deadline = self.began + problem.time_limit
         self.callback = callback
-        self.cancelled = False
-        self.late = False
-        self.scale = problem.sigma / np.sqrt(problem.repetitions)
-        self.last = Progress(0, problem.starts, float("inf"), 0.0, 0.0)
+        self.problem, self.size = problem, size
+        self.cancelled = self.late = False
+        self.last = Progress(0, problem.starts, float("nan"), float("nan"), 0.0)
 
     def stop(self) -> bool:
         self.late = self.late or time.perf_counter() > self.deadline
-        self.report(self.last)
+        self.tell()
         return self.late or self.cancelled
 
-    def starts(self, done: int, total: int, log_value: float) -> None:
-        accuracy = self.scale * float(np.exp(0.5 * log_value))
-        self.report(Progress(done, total, accuracy, self.last.lower_bound, 0.0))
-
-    def report(self, progress: Progress) -> None:
-        self.last = Progress(
-            progress.starts_done,
-            progress.starts_total,
-            progress.best_accuracy,
-            progress.lower_bound,
-            time.perf_counter() - self.began,
-        )
+    def tell(self, done: int | None = None, log_worth: float | None = None, bound: float | None = None) -> None:
+        changes: dict[str, float] = {"seconds": self.seconds}
+        if done is not None:
+            changes["starts_done"] = done
+        if log_worth is not None:
+            changes["best_accuracy"] = self._value(float(np.exp(log_worth)))
+        if bound is not None:
+            changes["lower_bound"] = self._value(bound)
+        self.last = replace(self.last, **changes)  # type: ignore[arg-type]
         if self.callback is not None and self.callback(self.last):
             self.cancelled = True
+
+    def _value(self, worth: float) -> float:
+        return reported_value(self.problem.criterion, worth, self.size, self.problem.measurements)
 
     @property
     def seconds(self) -> float:
         return time.perf_counter() - self.began
 
 
-def _bound(
-    problem: PlanProblem, space: _Space, found: SearchResult, rng: np.random.Generator, clock: _Clock
-) -> float:
-    """Lower bound on ρ0 [m] for the plan's number of measurements."""
-    start = np.concatenate([found.configurations, problem.test_pose_array])
-    relaxed = relaxed_design(space.robot, space.weight, start, rng, clock.stop)
-    total = problem.configurations * problem.repetitions
-    return problem.sigma * float(np.sqrt(relaxed.bound / total))
+def _criteria(space: PlanSpace, rng: np.random.Generator) -> tuple[Criterion, Criterion]:
+    """What the search maximises, and what the bound is about."""
+    problem = space.problem
+    if not problem.compound:
+        return space.search_criterion(), space.criterion(problem.criterion)
+    shares = {problem.criterion: 1.0 - sum(problem.compound.values()), **problem.compound}
+    parts = tuple(space.criterion(name) for name in shares)
+    references = tuple(_relax(space, part, rng, lambda: False).worth for part in parts)
+    made = Compound(parts, tuple(shares.values()), references)
+    return made, made
 
 
-def _assemble(problem: PlanProblem, space: _Space, found: SearchResult, bound: float, clock: _Clock) -> Plan:
-    robot, sigma = space.robot, problem.sigma
-    configurations = visiting_order(found.configurations, robot)
-    repetitions = np.full(len(configurations), problem.repetitions)
-    matrix = information(robot.jacobian(configurations), repetitions)
-    per = sigma * np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
-    weights = problem.weight_array / problem.weight_array.sum()
-    accuracy = float(np.sqrt(weights @ per**2)) if np.isfinite(per).all() else float("inf")
+def _relax(
+    space: PlanSpace, criterion: Criterion, rng: np.random.Generator, stop: Callable[[], bool]
+) -> RelaxedDesign:
+    problem = space.problem
+    relaxed = RelaxedProblem(
+        space.single, criterion, space.prior, problem.measurements, space.feasibility, _pool(problem)
+    )
+    tests = problem.test_pose_array
+    usable = tests[space.feasibility.mask(tests)] if problem.candidates is None else tests[:0]
+    return relaxed_design(relaxed, usable, rng, stop)
+
+
+def _pool(problem: PlanProblem) -> FloatArray | None:
+    return None if problem.candidates is None else np.asarray(problem.candidates)
+
+
+def _search(
+    space: PlanSpace,
+    criterion: Criterion,
+    relaxed: RelaxedDesign | None,
+    seeds: list[np.random.SeedSequence],
+    clock: _Clock,
+    executor: Executor | None,
+) -> SearchResult:
+    """All chunks, here or by the executor; the best of them, the first one if equal."""
+    nobody = np.empty((0, len(space.robot.joint_names)))
+    search = SearchProblem(
+        model=space.model,
+        criterion=criterion,
+        prior=space.prior,
+        size=space.problem.configurations,
+        feasibility=space.feasibility,
+        support=relaxed.support if relaxed else nobody,
+        weights=relaxed.weights if relaxed else np.empty(0),
+    )
+    starts = [len(part) for part in np.array_split(np.arange(space.problem.starts), CHUNKS)]
+    work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(starts, seeds, strict=True) if n]
+    best: SearchResult | None = None
+    done = evaluations = 0
+    futures = [executor.submit(search_chunk, *job) for job in work] if executor else None
+    for index, job in enumerate(work):
+        if futures is not None:
+            if index and clock.stop():
+                futures[index].cancel()
+                continue
+            result = futures[index].result()
+        else:
+            if index and clock.stop():
+                break
+            result = search_chunk(*job, clock.stop)
+        done, evaluations = done + result.starts, evaluations + result.evaluations
+        if best is None or result.log_worth > best.log_worth:
+            best = result
+        clock.tell(done, best.log_worth)
+    assert best is not None
+    return replace(best, starts=done, evaluations=evaluations)
+
+
+def _choose(space: PlanSpace, criterion: Criterion, rng: np.random.Generator, clock: _Clock) -> SearchResult:
+    """From the candidates."""
+    problem = space.problem
+    pool = np.asarray(problem.candidates)
+    allowed = np.flatnonzero(space.feasibility.mask(pool))
+    unit = space.model.at(pool[allowed])
+    chosen = choose(
+        PoolProblem(unit, criterion, space.prior, problem.configurations, problem.repeat_candidates, np.empty(0)),
+        rng,
+        clock.stop,
+    )
+    clock.tell(problem.starts, chosen.log_worth)
+    return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, 1, chosen.evaluations)
+
+
+# ── the answer ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def _assemble(
+    space: PlanSpace, target: Criterion, relaxed: RelaxedDesign | None, found: SearchResult, clock: _Clock
+) -> Plan:
+    problem, robot = space.problem, space.robot
+    configurations = found.configurations[visiting_order(found.configurations, robot)]
+    matrix = space.model.at(configurations).sum(axis=0) + space.prior
     inverse, hidden = covariance(matrix)
+    per = np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
+    shares = problem.weight_array / max(problem.weight_array.sum(), 1e-300)
+    accuracy = float(np.sqrt(shares @ per**2)) if len(per) else float("nan")
+    if _blind(space, hidden):
+        worth = 0.0
+    elif problem.criterion == "test_pose" and not problem.compound:
+        worth = accuracy**-2  # the figure reported, to the last digit
+    else:
+        worth = target.exact(_regular(matrix, hidden))
+    bound = max(relaxed.bound, worth) if relaxed else float("nan")
+    name = "compound" if problem.compound else problem.criterion
+    size, n = len(space.interest), problem.measurements
+    value = worth if problem.compound else reported_value(name, worth, size, n)
+    value_bound = bound if problem.compound or not relaxed else reported_value(name, bound, size, n)
     general = float("inf") if hidden.size else float(np.trace(space.general @ inverse))
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
     status = "singular" if hidden.size and status == "ok" else status
@@ -153,22 +235,24 @@ def _assemble(problem: PlanProblem, space: _Space, found: SearchResult, bound: f
     note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}."
     return Plan(
         robot=robot.name,
-        criterion=problem.criterion,
+        criterion=name,
         parameters=problem.robot.parameter_names,
         joint_names=robot.joint_names,
         configurations=configurations,
-        repetitions=repetitions,
+        repetitions=np.full(len(configurations), problem.repetitions),
         test_poses=problem.test_pose_array,
-        weights=weights,
-        sigma=sigma,
+        weights=shares,
+        sigma=problem.instrument.typical,
         predicted_accuracy=accuracy,
         predicted_accuracy_per_test_pose=per,
-        parameter_std=sigma * _parameter_deviations(space, inverse, hidden),
+        parameter_std=_parameter_deviations(space, inverse, hidden),
         unidentifiable=combinations,
-        general_accuracy=sigma * float(np.sqrt(general)),
-        lower_bound=bound,
-        efficiency=bound / accuracy if np.isfinite(accuracy) else 0.0,
-        bound="numerical",
+        general_accuracy=float(np.sqrt(general)),
+        value=value,
+        value_bound=value_bound,
+        lower_bound=value_bound if name in POSE_CRITERIA else float("nan"),
+        efficiency=efficiency(name, worth, bound) if relaxed else float("nan"),
+        bound="numerical" if relaxed else "none",
         status=status,
         message=STATUS[status] + (note if combinations else ""),
         seconds=clock.seconds,
@@ -178,40 +262,25 @@ def _assemble(problem: PlanProblem, space: _Space, found: SearchResult, bound: f
     )
 
 
-def _parameter_deviations(space: _Space, inverse: FloatArray, hidden: FloatArray) -> FloatArray:
-    """(P,) standard deviations for σ = 1: infinite where this plan is blind, NaN where every plan is."""
+def _blind(space: PlanSpace, hidden: FloatArray) -> bool:
+    """Whether the criterion needs what the plan cannot see."""
+    if not hidden.size:
+        return False
+    if space.problem.criterion not in POSE_CRITERIA or space.problem.compound:
+        return True
+    tests = space.test_jacobians
+    return bool(np.abs(tests @ hidden).max() > 1e-6 * np.abs(tests).max())
+
+
+def _regular(matrix: FloatArray, hidden: FloatArray) -> FloatArray:
+    """``matrix`` made invertible where the plan is blind; what does not look there is not changed by it."""
+    return matrix + float(np.trace(matrix)) * hidden @ hidden.T if hidden.size else matrix
+
+
+def _parameter_deviations(space: PlanSpace, inverse: FloatArray, hidden: FloatArray) -> FloatArray:
+    """(P,) standard deviations: infinite where this plan is blind, NaN where every plan is."""
     kept = sorted(space.identifiability.kept)
     unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(kept), bool)
     std = np.full(len(kept) + len(space.identifiability.held), np.nan)
     std[kept] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)))
     return std
-
-
-def visiting_order(configurations: FloatArray, robot: Robot) -> FloatArray:
-    """The same rows in an order with little joint travel: nearest neighbour, then 2-opt, from mid-range."""
-    scale = np.diff(robot.joint_limits, axis=1)[:, 0]
-    scaled = configurations / scale
-    home = robot.joint_limits.mean(axis=1) / scale
-    points = np.vstack([home, scaled])
-    distance = np.abs(points[:, None] - points[None]).max(axis=2)
-    left = set(range(1, len(points)))
-    tour = [0]
-    while left:
-        last = tour[-1]
-        tour.append(min(left, key=lambda i: (distance[last, i], i)))
-        left.remove(tour[-1])
-    improved = len(tour) <= 200
-    while improved:
-        improved = False
-        for i in range(1, len(tour) - 1):
-            for j in range(i + 1, len(tour)):
-                tail = (
-                    distance[tour[i], tour[j + 1]] - distance[tour[j], tour[j + 1]]
-                    if j + 1 < len(tour)
-                    else 0
-                )
-                gain = distance[tour[i - 1], tour[j]] - distance[tour[i - 1], tour[i]] + tail
-                if gain < -1e-12:
-                    tour[i : j + 1] = tour[i : j + 1][::-1]
-                    improved = True
-    return configurations[np.array(tour[1:]) - 1]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,81 +15,115 @@ from calib_planner._arrays import (
     check_count,
     check_number,
 )
-from calib_planner.design.identifiability import analyse
-from calib_planner.errors import InfeasibleError, InputError, UnknownNameError
+from calib_planner.design.criteria import CRITERIA
+from calib_planner.design.feasibility import Constraint
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.identification.measurements import Measurements
+from calib_planner.instrument.noise import Isotropic, Noise
 from calib_planner.robot.chain import Robot
 
-CRITERIA = ("test_pose",)
-SAMPLE = 512
-"""Random configurations that stand for the whole workspace."""
+POSE_CRITERIA = ("test_pose", "worst_pose")
+"""Criteria that need test poses."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanProblem:
-    """Choose ``configurations`` joint configurations that minimise eq. (14).
+    """Choose ``configurations`` joint configurations that are worth most by ``criterion``.
 
     Attributes:
-        robot: The robot, its active parameters being those to be identified.
-        test_poses: (K, joints) configurations where accuracy matters [rad | m].
+        robot: The robot, its active parameters being those to be identified. Base and target parameters
+            (``base.*``, ``target_*``) are nuisance: estimated with the rest, eliminated from the criterion.
+        test_poses: (K, joints) configurations where accuracy matters [rad | m]; a path is many of them.
         configurations: m, number of different configurations.
         repetitions: Measurements at each configuration.
         weights: (K,) weights of the test poses; default equal.
-        sigma: Standard deviation of one coordinate of one measured point [m].
-        criterion: One of ``CRITERIA``.
-        general_weight: Share of the criterion given to the mean accuracy over all joint limits. It keeps a
-            plan from going blind away from the test pose; 0 is the paper's plain criterion.
+        sigma: Standard deviation of one coordinate of one measured point [m]; see ``noise``.
+        criterion: One of ``criteria.CRITERIA``.
+        compound: Other criteria with their shares, e.g. ``{"d": 0.3}``: the plan then maximises the weighted
+            geometric mean of efficiencies, ``criterion`` keeping the rest of the weight.
+        general_weight: Share of the test-pose criterion given to the mean accuracy over all joint limits. It
+            keeps a plan from going blind away from the test pose; 0 is the paper's plain criterion.
+        noise: The instrument; default isotropic with ``sigma``.
+        configuration_sigma: σ_c, error of one coordinate that repeating a configuration does not average
+            away (robot repeatability) [m].
+        prior_std: What is known of parameters before: name → standard deviation [m | rad].
+        measured: Measurements already taken; the plan is for the *next* configurations.
+        constraints: Conditions on configurations besides the joint limits.
+        candidates: (C, joints) configurations to choose from, instead of all within the limits.
+        repeat_candidates: Whether one candidate may be chosen more than once.
         starts: Random starts of the search.
         seed: Same seed, same plan.
         time_limit: Seconds after which the best plan so far is returned.
     """
 
     robot: Robot
-    test_poses: ArrayLike
+    test_poses: ArrayLike | None
     configurations: int
     repetitions: int = 1
     weights: ArrayLike | None = None
     sigma: float = 3e-5
     criterion: str = "test_pose"
+    compound: Mapping[str, float] = field(default_factory=dict)
     general_weight: float = 1e-4
-    starts: int = 64
+    noise: Noise | None = None
+    configuration_sigma: float = 0.0
+    prior_std: Mapping[str, float] = field(default_factory=dict)
+    measured: Measurements | None = None
+    constraints: tuple[Constraint, ...] = ()
+    candidates: ArrayLike | None = None
+    repeat_candidates: bool = False
+    starts: int = 48
     seed: int = 0
     time_limit: float = float("inf")
 
     def __post_init__(self) -> None:
-        put = object.__setattr__
-        robot = self.robot
+        put, robot = object.__setattr__, self.robot
         if not isinstance(robot, Robot):
             raise InputError("robot", type(robot).__name__, "a Robot", "use Robot.load(...)")
+        if not robot.parameter_names:
+            raise InputError("robot", "no active parameters", "at least one", "use robot.with_parameters(...)")
         if self.criterion not in CRITERIA:
             raise UnknownNameError("criterion", str(self.criterion), CRITERIA)
-        put(
-            self,
-            "test_poses",
-            check_configurations("test_poses", self.test_poses, robot.joint_names),
-        )
-        _check_within_limits(robot, self.test_pose_array)
+        put(self, "compound", _check_compound(self.compound))
+        self._check_poses()
         put(self, "configurations", check_count("configurations", self.configurations, high=10_000))
         put(self, "repetitions", check_count("repetitions", self.repetitions, high=100_000))
-        count = len(self.test_pose_array)
-        weights = check_array("weights", np.ones(count) if self.weights is None else self.weights, (count,))
-        if (weights < 0).any() or not weights.any():
-            raise InputError("weights", weights.tolist(), "numbers >= 0, not all zero")
-        put(self, "weights", weights)
-        put(
-            self,
-            "sigma",
-            check_number("sigma", self.sigma, low=0, low_open=True, high=1.0, unit="m"),
-        )
-        put(
-            self,
-            "general_weight",
-            check_number("general_weight", self.general_weight, low=0, high=1),
-        )
+        put(self, "sigma", check_number("sigma", self.sigma, low=0, low_open=True, high=1.0, unit="m"))
+        put(self, "noise", Isotropic(self.sigma) if self.noise is None else self.noise)
+        share = check_number("general_weight", self.general_weight, low=0, high=1)
+        put(self, "general_weight", share)
+        common = check_number("configuration_sigma", self.configuration_sigma, low=0, high=1, unit="m")
+        put(self, "configuration_sigma", common)
+        put(self, "prior_std", _check_prior(self.prior_std, robot))
+        if self.measured is not None:
+            put(self, "measured", _check_measured(self.measured, robot))
+        put(self, "constraints", tuple(self.constraints))
+        if self.candidates is not None:
+            pool = check_configurations("candidates", self.candidates, robot.joint_names)
+            put(self, "candidates", pool)
+            if not self.repeat_candidates and len(pool) < self.configurations:
+                raise InputError("candidates", f"{len(pool)} rows", f"at least {self.configurations}, one each")
         put(self, "starts", check_count("starts", self.starts, high=100_000))
         put(self, "seed", check_count("seed", self.seed, low=0, high=2**63 - 1))
         if not self.time_limit > 0:
             raise InputError("time_limit", self.time_limit, "a number of seconds > 0")
-        _check_enough(robot, self.configurations)
+
+    def _check_poses(self) -> None:
+        put, robot = object.__setattr__, self.robot
+        if self.test_poses is None or np.size(self.test_poses) == 0:
+            wanting = [c for c in (self.criterion, *self.compound) if c in POSE_CRITERIA]
+            if wanting:
+                raise InputError("test_poses", "none", f"at least one, criterion {wanting[0]} needs it")
+            put(self, "test_poses", np.empty((0, len(robot.joint_names))))
+        else:
+            poses = check_configurations("test_poses", self.test_poses, robot.joint_names)
+            _check_within_limits(robot, poses)
+            put(self, "test_poses", poses)
+        count = len(self.test_pose_array)
+        weights = check_array("weights", np.ones(count) if self.weights is None else self.weights, (count,))
+        if count and ((weights < 0).any() or not weights.any()):
+            raise InputError("weights", weights.tolist(), "numbers >= 0, not all zero")
+        put(self, "weights", weights)
 
     @property
     def test_pose_array(self) -> FloatArray:
@@ -99,6 +134,17 @@ class PlanProblem:
     def weight_array(self) -> FloatArray:
         """``weights`` as the array that the constructor made of it."""
         return np.asarray(self.weights)
+
+    @property
+    def instrument(self) -> Noise:
+        """``noise``, never ``None`` once constructed."""
+        assert self.noise is not None
+        return self.noise
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements the plan will hold."""
+        return self.configurations * self.repetitions
 
 
 def _check_within_limits(robot: Robot, poses: FloatArray) -> None:
@@ -114,30 +160,28 @@ def _check_within_limits(robot: Robot, poses: FloatArray) -> None:
         )
 
 
-def reachable_sample(robot: Robot, count: int) -> FloatArray:
-    """(count, 3·targets, P) Jacobians at fixed random configurations within the joint limits."""
-    low, high = robot.joint_limits.T
-    return robot.jacobian(np.random.default_rng(0).uniform(low, high, (count, len(low))))
+def _check_compound(shares: Mapping[str, float]) -> dict[str, float]:
+    checked = {}
+    for name, share in dict(shares).items():
+        if name not in CRITERIA:
+            raise UnknownNameError("compound", str(name), CRITERIA)
+        if name in ("o2", "o4"):
+            raise InputError("compound", name, "a concave criterion (all but o2 and o4)")
+        checked[name] = check_number(f"compound[{name}]", share, low=0, low_open=True, high=1)
+    if sum(checked.values()) >= 1:
+        raise InputError("compound", checked, "shares that leave some weight to the criterion itself")
+    return checked
 
 
-def _check_enough(robot: Robot, configurations: int) -> None:
-    """Refuse what so few configurations cannot identify, whichever they are."""
-    jacobians = reachable_sample(robot, SAMPLE)
-    names = robot.parameter_names
-    if not names:
-        raise InputError("robot", "a robot without active parameters", "use robot.with_parameters(...)")
-    rank = analyse(jacobians.reshape(-1, len(names)), names).rank
-    if rank == 0:
-        raise InfeasibleError(
-            "parameters",
-            f"no measurement of these targets depends on {', '.join(names)}; choose other parameters, or "
-            "give the tool a target off the last axis",
-        )
-    per_row = max(int(np.linalg.matrix_rank(j)) for j in jacobians[:8])
-    needed = -(-rank // per_row)
-    if configurations < needed:
-        raise InfeasibleError(
-            "configurations",
-            f"{configurations} configurations give at most {configurations * per_row} equations for "
-            f"{rank} identifiable parameters; ask for at least {needed}, or for fewer parameters",
-        )
+def _check_prior(prior: Mapping[str, float], robot: Robot) -> dict[str, float]:
+    for name in prior:
+        if name not in robot.parameter_names:
+            raise UnknownNameError("prior_std", str(name), robot.parameter_names)
+    return {n: check_number(f"prior_std[{n}]", v, low=0, low_open=True) for n, v in prior.items()}
+
+
+def _check_measured(measured: Measurements, robot: Robot) -> Measurements:
+    ordered = measured.in_order_of(robot.joint_names)
+    if ordered.p.shape[1] != len(robot.targets):
+        raise InputError("measured", f"{ordered.p.shape[1]} targets", f"{len(robot.targets)}, as the robot has")
+    return ordered

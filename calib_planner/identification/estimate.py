@@ -157,8 +157,7 @@ class Estimate:
             "covariance": self.covariance,
             "rank": self.rank,
             "unidentifiable": [
-                {"parameter": n, "combination": c}
-                for n, c in zip(self.held, self.unidentifiable, strict=True)
+                {"parameter": n, "combination": c} for n, c in zip(self.held, self.unidentifiable, strict=True)
             ],
             "measurements": self.measurements,
             "used": self.used,

@@ -40,9 +40,7 @@ class Measurements:
         partly = np.isnan(points).any(axis=2) & ~np.isnan(points).all(axis=2)
         if partly.any():
             i, t = (int(v) for v in np.argwhere(partly)[0])
-            raise InputError(
-                f"points[{i}], target {t + 1}", "some of x, y, z", "all three coordinates or none"
-            )
+            raise InputError(f"points[{i}], target {t + 1}", "some of x, y, z", "all three coordinates or none")
         put(self, "points", points)
         if self.std is not None:
             std = check_array("std", self.std, points.shape, finite=False, meaning=meaning)
@@ -81,8 +79,6 @@ class Measurements:
             InputError: The names are not the same set.
         """
         if set(joint_names) != set(self.joint_names):
-            raise InputError(
-                "joint names", ", ".join(self.joint_names), f"the robot's: {', '.join(joint_names)}"
-            )
+            raise InputError("joint names", ", ".join(self.joint_names), f"the robot's: {', '.join(joint_names)}")
         order = [self.joint_names.index(n) for n in joint_names]
         return Measurements(tuple(joint_names), self.q[:, order], self.p, self.std)

@@ -23,8 +23,10 @@ from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
 from calib_planner.robot.chain import Robot
 
-STEP_TOLERANCE = 1e-10
-"""A scaled step this small relative to the residuals' scale ends the iteration."""
+STEP_TOLERANCE = 1e-7
+"""A step that moves the predictions by less than this share of the residuals ends the iteration."""
+STEP_FLOOR = 1e-10
+"""The same without residuals, in whitened units (standard deviations, or metres where none are known)."""
 
 
 def identify(problem: IdentificationProblem) -> Estimate:
@@ -119,12 +121,12 @@ def _iterate(system: _System, deviations: FloatArray, most: int) -> _Fit:
             new = system.residuals(trial)
             new_cost = float(new @ new)
         size = np.linalg.norm(unit @ step)
-        floor = STEP_TOLERANCE * (1.0 + np.linalg.norm(residuals))
+        floor = STEP_FLOOR + STEP_TOLERANCE * np.linalg.norm(residuals)
         if new_cost <= cost or size <= floor:
             deviations = trial if new_cost <= cost else deviations
             residuals, jacobian = system.linearise(deviations)
             damping = 0.0 if damping < 1e-6 else damping / 10
-            converged = size <= max(floor, 1e-13 * np.linalg.norm(residuals))
+            converged = bool(size <= floor)
         else:
             damping = max(10 * damping, 1e-6)
     return _Fit(deviations, found, jacobian, residuals, done, converged)
@@ -143,9 +145,7 @@ def _weights(problem: IdentificationProblem) -> FloatArray:
 # ── the answer ───────────────────────────────────────────────────────────────────────────────────────
 
 
-def _estimate(
-    problem: IdentificationProblem, robot: Robot, system: _System, fit: _Fit, began: float
-) -> Estimate:
+def _estimate(problem: IdentificationProblem, robot: Robot, system: _System, fit: _Fit, began: float) -> Estimate:
     names = robot.parameter_names
     kept = list(fit.identifiability.kept)
     redundancy = len(fit.residuals) - len(kept)

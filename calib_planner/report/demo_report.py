@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from calib_planner._arrays import FloatArray
-from calib_planner.design.information import error_variance, information
+from calib_planner.design.information import InformationModel, error_variance
 from calib_planner.design.plan import Plan, plain
 from calib_planner.design.problem import PlanProblem
 from calib_planner.errors import InputError
@@ -176,10 +176,11 @@ def _random_plans(problem: PlanProblem, cell: SimulatedCell, seed: int, count: i
 
 def _accuracy(robot: Robot, q: FloatArray, problem: PlanProblem) -> float:
     """ρ0 of eq. (14) [m] of a plan with configurations ``q`` (m, joints) [rad | m]."""
-    matrix = information(robot.jacobian(q), np.full(len(q), problem.repetitions))
+    model = InformationModel(robot, problem.instrument, repetitions=problem.repetitions)
+    matrix = model.at(q).sum(axis=0)
     variances = [error_variance(j, matrix) for j in robot.jacobian(problem.test_pose_array)]
     weights = problem.weight_array / problem.weight_array.sum()
-    return problem.sigma * float(np.sqrt(weights @ np.array(variances)))
+    return float(np.sqrt(weights @ np.array(variances)))
 
 
 def _rms(values: FloatArray) -> float:

@@ -151,6 +151,8 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
         parameter_std=np.full(len(message.parameters), np.nan),
         unidentifiable=(),
         general_accuracy=float("nan"),
+        value=float(message.predicted_accuracy),
+        value_bound=float(message.lower_bound),
         lower_bound=float(message.lower_bound),
         efficiency=float(message.efficiency),
         bound=message.bound,
@@ -173,9 +175,7 @@ def check_rows(field: str, flat: ArrayLike, joints: Sequence[str], least: int = 
     values = np.asarray(flat, dtype=float).ravel()
     n = len(joints)
     if values.size % n or not least * n <= values.size <= MOST_ROWS * n:
-        expected = (
-            f"rows of {n} numbers, joints in the order {', '.join(joints)}, {least} to {MOST_ROWS} rows"
-        )
+        expected = f"rows of {n} numbers, joints in the order {', '.join(joints)}, {least} to {MOST_ROWS} rows"
         raise InputError(field, f"{values.size} numbers", expected)
     rows = values.reshape(-1, n)
     return check_array(field, rows, (None, n), meaning="joints in rad or m")

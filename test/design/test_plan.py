@@ -7,34 +7,17 @@ import json
 
 import numpy as np
 import pytest
-from robots import CASES, mixed, random_configurations
+from robots import mixed, random_configurations
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, UnknownNameError, plan
-from calib_planner.design.criteria import LinearCriterion, accuracy_weight
-from calib_planner.design.planner import visiting_order
+from calib_planner.design.order import visiting_order
 from calib_planner.design.search.descent import descend
-from calib_planner.design.search.multistart import plan_objective
 
 TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 
 
 def kuka():
     return Robot.load("kuka_kr270")
-
-
-@pytest.mark.parametrize("name", ["planar_2r", "kuka_kr270", "mixed offsets"])
-def test_gradient_of_the_criterion(name):
-    """Against central differences of the value."""
-    robot, m = CASES[name](), 5
-    weight = accuracy_weight(robot.jacobian(random_configurations(robot, 2, 5)), np.ones(2))
-    objective = plan_objective(robot, LinearCriterion(weight), m)
-    rows = random_configurations(robot, 3 * m, 1).reshape(3, -1)
-    gradient = objective(rows)[1]
-    h = 1e-6
-    for k in range(rows.shape[1]):
-        step = h * np.eye(rows.shape[1])[k]
-        expected = (objective(rows + step)[0] - objective(rows - step)[0]) / (2 * h)
-        np.testing.assert_allclose(gradient[:, k], expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("m", [3, 4, 12])
@@ -83,7 +66,7 @@ def test_progress_and_cancel_return_a_valid_plan():
     assert found.status == "cancelled"
     assert found.configurations.shape == (6, 6)
     assert found.lower_bound <= found.predicted_accuracy
-    assert seen[0].starts_total == 64
+    assert seen[0].starts_total == 48
 
 
 def test_time_limit_returns_a_valid_plan():
@@ -128,7 +111,7 @@ def test_plan_is_immutable_and_plain():
 def test_visiting_order_shortens_travel():
     robot = kuka()
     q = random_configurations(robot, 20)
-    ordered = visiting_order(q, robot)
+    ordered = q[visiting_order(q, robot)]
     assert sorted(map(tuple, ordered)) == sorted(map(tuple, q))
     scale = np.diff(robot.joint_limits, axis=1)[:, 0]
 
@@ -172,12 +155,12 @@ def test_unknown_criterion_lists_the_known():
 
 def test_too_few_configurations_says_how_many():
     with pytest.raises(InfeasibleError, match="at least 3"):
-        PlanProblem(kuka(), TEST_POSE, 2)
+        plan(PlanProblem(kuka(), TEST_POSE, 2))
 
 
 def test_parameters_without_any_effect_are_refused():
     with pytest.raises(InfeasibleError, match="q6"):
-        PlanProblem(kuka().with_parameters("q6"), TEST_POSE, 4)
+        plan(PlanProblem(kuka().with_parameters("q6"), TEST_POSE, 4))
 
 
 def test_descent_finds_known_minima_in_a_batch():
@@ -192,9 +175,7 @@ def test_descent_finds_known_minima_in_a_batch():
     starts = np.random.default_rng(0).uniform(-2, 2, (16, 2))
     wide = descend(rosenbrock, starts, np.full(2, -3.0), np.full(2, 3.0), iterations=400, tolerance=1e-14)
     np.testing.assert_allclose(wide.x, 1.0, atol=1e-4)
-    held = descend(
-        rosenbrock, starts, np.full(2, -3.0), np.array([0.5, 3.0]), iterations=400, tolerance=1e-14
-    )
+    held = descend(rosenbrock, starts, np.full(2, -3.0), np.array([0.5, 3.0]), iterations=400, tolerance=1e-14)
     np.testing.assert_allclose(held.x, [[0.5, 0.25]] * 16, atol=1e-5)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib_planner import IdentificationProblem, PlanProblem, Robot, identify, plan
-from calib_planner.design.information import covariance, error_variance, information
+from calib_planner.design.information import InformationModel, covariance, error_variance
+from calib_planner.instrument.noise import Isotropic
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 PAIRS = ["l1,l2", "dq1,dq2"]
@@ -16,13 +17,18 @@ def two_link(parameters="l1,l2"):
     return Robot.load("planar_2r").with_parameters(parameters)
 
 
+def information(robot, q):
+    """Σ JᵀJ: σ = 1."""
+    return InformationModel(robot, Isotropic(1.0)).at(q).sum(axis=0)
+
+
 def random_q(count, seed):
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 2))
 
 
 def variance(robot, q, q0):
     """ρ0²/σ² of eq. (14) by the general machinery."""
-    return error_variance(robot.jacobian(q0)[0], information(robot.jacobian(q), np.ones(len(q))))
+    return error_variance(robot.jacobian(q0)[0], information(robot, q))
 
 
 def equation_18(q2, q20):
@@ -45,7 +51,7 @@ def test_equation_17(seed):
     robot, q = two_link(), random_q(4, seed)
     m, s = 4, np.cos(q[:, 1]).sum()
     expected = np.array([[m, -s], [-s, m]]) / (m**2 - s**2)
-    got, hidden = covariance(information(robot.jacobian(q), np.ones(m)))
+    got, hidden = covariance(information(robot, q))
     np.testing.assert_allclose(got, expected, rtol=1e-10)
     assert hidden.size == 0
 

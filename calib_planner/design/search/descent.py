@@ -140,9 +140,7 @@ def _line_search(
     return best_x, best_value, best_g, used
 
 
-def _update(
-    inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray
-) -> None:
+def _update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray) -> None:
     """BFGS update of the inverse Hessians of ``rows``, scaled at first use, skipped where s·y ≤ 0."""
     sy = (s * y).sum(axis=1)
     good = sy > 1e-10 * np.linalg.norm(s, axis=1) * np.linalg.norm(y, axis=1)

@@ -1,11 +1,16 @@
-"""The best plan over continuous configurations: many descents of log ρ0² from seeded starts.
+"""The best plan over continuous configurations: many descents of −log Ψ from seeded starts.
 
-Gradient. For a plan with Jacobians J_i and M = Σ J_iᵀJ_i, the slope Φ = ∂φ/∂M gives ∂φ/∂J_i = 2 J_i Φ, which
-``Linearisation.pull_back`` turns into ∂φ/∂q_i: the whole gradient costs about as much as the value.
+Gradient. For a plan with M = M_0 + Σ I(q_i), the slope G = ∂Ψ/∂M turns into ∂Ψ/∂q_i by
+``LinearisedInformation.gradient``: the whole gradient costs about as much as the value.
 
-Starts. Random configurations within the limits; and, because eq. (20) and the paper's Table 2 show that good
-plans are made of a few good configurations repeated, the best small plans found first are tiled to the
-size asked for.
+Starts. A third draws configurations from the relaxed optimum (see ``bound``) in proportion to its weights —
+rounding it, which the descent then repairs; a third repeats a good small plan, because eq. (20) and the paper's
+Table 2 show that good plans are a few good configurations repeated; the rest is random.
+
+Feasibility. Plans that break a constraint are worth nothing (−log Ψ = ∞): a descent that starts inside never
+accepts a step outside, so what comes out is feasible by construction.
+
+Work is cut into ``CHUNKS`` independent parts with their own seeds, whatever executes them: same seed, same plan.
 """
 
 from __future__ import annotations
@@ -16,95 +21,128 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_planner._arrays import FloatArray
-from calib_planner.design.criteria import LinearCriterion
-from calib_planner.design.search.descent import Objective, descend
-from calib_planner.robot.chain import Robot
+from calib_planner.design.criteria import Criterion
+from calib_planner.design.feasibility import Feasibility
+from calib_planner.design.information import InformationModel
+from calib_planner.design.search.descent import Descent, Objective, descend
 
 RIDGE = 1e-12
-"""Added to the scaled information of a plan, relative to its trace, so that singular plans stay finite."""
+"""Added to the information of a plan, relative to its diagonal, so that singular plans stay finite."""
+CHUNKS = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class SearchProblem:
+    """Choose ``size`` configurations.
+
+    Attributes:
+        model: Information of one configuration.
+        criterion: Its worth is maximised.
+        prior: (p, p) M_0.
+        size: Number of configurations.
+        feasibility: What they have to obey besides the joint limits.
+        support: (K, joints) configurations of the relaxed optimum; K may be 0.
+        weights: (K,) their weights.
+    """
+
+    model: InformationModel
+    criterion: Criterion
+    prior: FloatArray
+    size: int
+    feasibility: Feasibility
+    support: FloatArray
+    weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class SearchResult:
-    """Best configurations found, (m, joints), their criterion value, and the work it took."""
+    """Best configurations (size, joints), the log of their worth, and the work it took."""
 
     configurations: FloatArray
-    value: float
+    log_worth: float
     starts: int
     evaluations: int
 
 
-def plan_objective(robot: Robot, criterion: LinearCriterion, size: int) -> Objective:
-    """log criterion and gradient of plans given as rows of ``size``·joints coordinates."""
-    parameters = len(robot.parameter_names)
-    targets = len(robot.targets)
-    zero = np.zeros(parameters)
+def plan_objective(problem: SearchProblem, size: int) -> Objective:
+    """−log Ψ and gradient of plans given as rows of ``size``·joints coordinates."""
 
     def objective(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        plans = len(rows)
-        lin = robot._linearise(rows.reshape(plans * size, -1), zero)
-        jacobian = lin.jacobian().reshape(plans, size * 3 * targets, parameters)
-        matrix = jacobian.transpose(0, 2, 1) @ jacobian
+        q = rows.reshape(len(rows) * size, -1)
+        info = problem.model.linearised(q)
+        matrix = info.sums(size) + problem.prior
         diagonal = np.einsum("spp->sp", matrix)
         diagonal += RIDGE * diagonal.mean(axis=1, keepdims=True)
-        value, slope = criterion.value_and_slope(matrix)
-        value = np.where(value > 0, value, np.inf)
-        pull = 2.0 * (jacobian @ (slope / value[:, None, None]))
-        weights = pull.reshape(plans * size, 3 * targets, parameters).transpose(2, 1, 0)
-        gradient = lin.pull_back(weights.reshape(parameters, targets, 3, plans * size))
-        return np.log(value), gradient.reshape(plans, -1)
+        worth, slope = problem.criterion.worth_and_slope(matrix)
+        usable = worth > 0
+        if problem.feasibility.constraints:
+            usable &= problem.feasibility.mask(q).reshape(len(rows), size).all(axis=1)
+        safe = np.where(usable, worth, 1.0)
+        gradient = info.gradient(-slope / safe[:, None, None])
+        return np.where(usable, -np.log(safe), np.inf), gradient.reshape(len(rows), -1)
 
     return objective
 
 
-def search(
-    robot: Robot,
-    criterion: LinearCriterion,
-    size: int,
+def search_chunk(
+    problem: SearchProblem,
     starts: int,
     rng: np.random.Generator,
-    stop: Callable[[], bool],
-    progress: Callable[[int, int, float], None] = lambda done, total, best: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> SearchResult:
-    """Find a plan of ``size`` configurations that minimises the criterion.
-
-    Args:
-        stop: Asked between iterations; ``True`` returns the best so far.
-        progress: Called with starts done, starts in all and the best log value so far.
-    """
-    low, high = robot.joint_limits.T
-    parameters = len(robot.parameter_names)
-    smallest = max(-(-parameters // (3 * len(robot.targets))), 1)
-    kernel_sizes = [k for k in (smallest, smallest + 1) if k < size]
-    shares = len(kernel_sizes) + 1
-    evaluations, done = 0, 0
-    seeds: list[FloatArray] = []
-    for k in kernel_sizes:
-        count = max(starts // shares, 1)
-        kernel = _descend_from(robot, criterion, k, _random(rng, low, high, count, k), stop, 100)
-        evaluations += kernel.evaluations
-        done += count
-        order = np.argsort(kernel.value)[: max(4, count // 8)]
-        seeds += [_tile(kernel.x[i].reshape(k, -1), size, rng, low, high) for i in order]
-        progress(done, starts, float(kernel.value[order[0]] - np.log(size / k)))
-    count = max(starts - done, 1)
-    fresh = _random(rng, low, high, count, size)
-    rows = np.concatenate([np.reshape(seeds, (-1, size, len(low))), fresh])
-    final = _descend_from(robot, criterion, size, rows, stop, 150)
+    """One part of the work: ``starts`` descents, the best of them."""
+    size = problem.size
+    rows, used = _starts(problem, starts, rng, stop)
+    final = _descend_from(problem, size, rows, stop, 150)
     best = int(np.argmin(final.value))
-    progress(starts, starts, float(final.value[best]))
-    return SearchResult(
-        final.x[best].reshape(size, -1),
-        float(np.exp(final.value[best])),
-        done + count,
-        evaluations + final.evaluations,
-    )
+    configurations = final.x[best].reshape(size, -1)
+    return SearchResult(configurations, -float(final.value[best]), starts, used + final.evaluations)
 
 
-def _descend_from(robot, criterion, size, rows, stop, iterations):  # type: ignore[no-untyped-def]
-    low, high = robot.joint_limits.T
+def _starts(
+    problem: SearchProblem, starts: int, rng: np.random.Generator, stop: Callable[[], bool]
+) -> tuple[FloatArray, int]:
+    """(rows, size, joints) starting plans, and plans evaluated on the way."""
+    size, draw = problem.size, problem.feasibility.sample
+    parts, evaluations = [], 0
+    rounded = -(-starts // 3) if len(problem.support) else 0
+    if rounded:
+        picks = rng.choice(len(problem.support), (rounded, size), p=problem.weights)
+        parts.append(_shake(problem, problem.support[picks], rng))
+    kernel_size = _smallest(problem)
+    tiled = -(-starts // 3) if kernel_size < size else 0
+    if tiled:
+        first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
+        kernel = _descend_from(problem, kernel_size, first, stop, 100)
+        evaluations += kernel.evaluations
+        best = np.argsort(kernel.value)[: max(2, tiled // 4)]
+        rows = np.resize(np.arange(kernel_size), size)
+        parts.append(_shake(problem, kernel.x[best].reshape(len(best), kernel_size, -1)[:, rows], rng))
+    random = max(starts - rounded - tiled, 1)
+    parts.append(draw(rng, random * size).reshape(random, size, -1))
+    return np.concatenate(parts), evaluations
+
+
+def _smallest(problem: SearchProblem) -> int:
+    """Configurations needed to identify everything without a prior."""
+    robot = problem.model.robot
+    return max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
+
+
+def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Move copies apart a little, where that is feasible."""
+    low, high = problem.model.robot.joint_limits.T
+    moved = np.clip(plans + rng.normal(0.0, 0.02, plans.shape), low, high)
+    ok = problem.feasibility.mask(moved.reshape(-1, len(low))).reshape(plans.shape[:2])
+    return np.where(ok[:, :, None], moved, plans)
+
+
+def _descend_from(
+    problem: SearchProblem, size: int, rows: FloatArray, stop: Callable[[], bool], iterations: int
+) -> Descent:
+    low, high = problem.model.robot.joint_limits.T
     return descend(
-        plan_objective(robot, criterion, size),
+        plan_objective(problem, size),
         rows.reshape(len(rows), -1),
         np.tile(low, size),
         np.tile(high, size),
@@ -112,15 +150,3 @@ def _descend_from(robot, criterion, size, rows, stop, iterations):  # type: igno
         tolerance=1e-6,
         stop=stop,
     )
-
-
-def _random(rng: np.random.Generator, low: FloatArray, high: FloatArray, count: int, size: int) -> FloatArray:
-    return rng.uniform(low, high, (count, size, len(low)))
-
-
-def _tile(
-    kernel: FloatArray, size: int, rng: np.random.Generator, low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """Repeat a small plan to ``size`` rows, moved a little so that copies can drift apart."""
-    rows = np.resize(np.arange(len(kernel)), size)
-    return np.clip(kernel[rows] + rng.normal(0.0, 0.02, (size, kernel.shape[1])), low, high)
