@@ -112,9 +112,7 @@ def test_poses(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
     return np.vstack(found) if found else None
 
 
-def _rows(
-    option: str, rows: Sequence[Sequence[float]], length: int, names: Sequence[str] = "xyz"
-) -> FloatArray:
+def _rows(option: str, rows: Sequence[Sequence[float]], length: int, names: Sequence[str] = "xyz") -> FloatArray:
     for row in rows:
         if len(row) != length:
             raise InputError(option, f"{len(row)} numbers", f"{length} numbers: {', '.join(names)}")

@@ -41,9 +41,7 @@ frame [m]; empty cells: not measured. Optional std_x1,… [m] weigh the points. 
 
 def add(commands: Commands) -> None:
     """Add the command's parser."""
-    parser = add_command(
-        commands, "identify", "identify parameters from measurements", run, EXAMPLE, DESCRIPTION
-    )
+    parser = add_command(commands, "identify", "identify parameters from measurements", run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
     add_parameters(parser)
     data = parser.add_argument_group("measurements")

@@ -110,8 +110,6 @@ def _check_output(output: str | None) -> None:
 
 def _write(output: str, found: Plan) -> None:
     if output.lower().endswith(".csv"):
-        write_configurations(
-            output, found.joint_names, found.configurations, found.repetitions, field="--output"
-        )
+        write_configurations(output, found.joint_names, found.configurations, found.repetitions, field="--output")
     else:
         write_plan(output, found, "--output")

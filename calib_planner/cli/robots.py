@@ -72,9 +72,7 @@ def describe(robot: Robot) -> dict[str, Any]:
             "targets": robot.target_offsets,
             "parameters": robot.parameter_names,
             "levels": dict(robot.levels),
-            "available_parameters": [
-                {"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in everything
-            ],
+            "available_parameters": [{"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in everything],
         }
     )
     return result
@@ -85,9 +83,7 @@ def _show(robot: Robot, console: Console) -> None:
     joints = Table("joint", "unit", title="joints, in this order")
     joints.add_column("lower", justify="right")
     joints.add_column("upper", justify="right")
-    for name, turns, limits in zip(
-        robot.joint_names, robot.joint_is_revolute, robot.joint_limits, strict=True
-    ):
+    for name, turns, limits in zip(robot.joint_names, robot.joint_is_revolute, robot.joint_limits, strict=True):
         shown = np.degrees(limits) if turns else 1e3 * limits
         joints.add_row(name, "°" if turns else "mm", *(f"{v:.2f}" for v in shown))
     console.print(joints)

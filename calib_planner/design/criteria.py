@@ -92,9 +92,8 @@ class Accuracy(_Smooth):
     def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(matrices)
         half = inverse @ self.weight
-        worth = 1.0 / np.trace(half, axis1=1, axis2=2)
-        slope = (worth**2)[:, None, None] * (half @ inverse)
-        return np.asarray(worth), _symmetric(slope)
+        worth: FloatArray = np.asarray(1.0 / np.trace(half, axis1=1, axis2=2), np.float64)
+        return worth, _symmetric((worth**2)[:, None, None] * (half @ inverse))
 
 
 @dataclass(frozen=True)

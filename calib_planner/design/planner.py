@@ -251,7 +251,7 @@ def _assemble(
         value=value,
         value_bound=value_bound,
         lower_bound=value_bound if name in POSE_CRITERIA else float("nan"),
-        efficiency=efficiency(name, worth, bound) if relaxed else float("nan"),
+        efficiency=_efficiency(name, worth, bound, value, value_bound) if relaxed else float("nan"),
         bound="numerical" if relaxed else "none",
         status=status,
         message=STATUS[status] + (note if combinations else ""),
@@ -260,6 +260,13 @@ def _assemble(
         starts=found.starts,
         evaluations=found.evaluations,
     )
+
+
+def _efficiency(name: str, worth: float, bound: float, value: float, value_bound: float) -> float:
+    """In the criterion's own convention; for accuracies the quotient of the two figures reported."""
+    if name in POSE_CRITERIA:
+        return value_bound / value if np.isfinite(value) else 0.0
+    return efficiency(name, worth, bound)
 
 
 def _blind(space: PlanSpace, hidden: FloatArray) -> bool:

@@ -339,9 +339,7 @@ class StandstillDetector:
                 f"the robot moved on {(stop - begin) / NANO:.2f} s after settling: dwell longer",
             )
         most = max(len(w.between(begin, stop)) for w in self._targets)
-        text = (
-            f"{most} points in {(stop - begin) / NANO:.2f} s, at least {self.settings.minimum_samples} needed"
-        )
+        text = f"{most} points in {(stop - begin) / NANO:.2f} s, at least {self.settings.minimum_samples} needed"
         return Reason.TOO_FEW_SAMPLES, f"{text}: check the tracker, its topic and its rate, or dwell longer"
 
     def _rejection(self, start: int, stop: int, reason: Reason, message: str) -> Rejection:

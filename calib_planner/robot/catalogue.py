@@ -38,6 +38,4 @@ def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: st
             return read_robot_yaml(path)
         if path.suffix.lower() in URDF_SUFFIXES:
             return read_urdf(path, base_link, tip_link)
-    raise UnknownNameError(
-        "robot", str(source), [*shipped_robots(), "PATH.urdf", "PATH.yaml (an existing file)"]
-    )
+    raise UnknownNameError("robot", str(source), [*shipped_robots(), "PATH.urdf", "PATH.yaml (an existing file)"])

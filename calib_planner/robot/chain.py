@@ -55,9 +55,7 @@ class Robot:
     def __post_init__(self) -> None:
         joints = [e.joint for e in self.elements if e.joint is not None]
         if sorted(joints) != list(range(len(self.joint_names))):
-            raise InputError(
-                "elements", f"joints {sorted(joints)}", "every joint to move exactly one element"
-            )
+            raise InputError("elements", f"joints {sorted(joints)}", "every joint to move exactly one element")
         limits = check_array("joint_limits", self.joint_limits, (len(self.joint_names), 2))
         for name, (low, high) in zip(self.joint_names, limits, strict=True):
             if not low < high:
@@ -87,9 +85,7 @@ class Robot:
 
     def with_parameters(self, request: str | Sequence[str], unknown: Iterable[str] = ()) -> Robot:
         """The same robot with other active parameters; see ``parameters.resolve_parameters``."""
-        names = resolve_parameters(
-            request, unknown, self.available_parameters, self.levels, len(self.targets)
-        )
+        names = resolve_parameters(request, unknown, self.available_parameters, self.levels, len(self.targets))
         return replace(self, parameter_names=names)
 
     def with_deviations(self, deviations: Mapping[str, float]) -> Robot:
@@ -282,8 +278,6 @@ class Robot:
 def target_elements(xyz: FloatArray) -> tuple[tuple[Element, ...], ...]:
     """Branches from the tip to targets at ``xyz`` (targets, 3) [m], with parameters target_k.x, .y, .z."""
     return tuple(
-        tuple(
-            Element("T" + a, float(v), parameter=f"target_{t}.{a}") for a, v in zip("xyz", row, strict=True)
-        )
+        tuple(Element("T" + a, float(v), parameter=f"target_{t}.{a}") for a, v in zip("xyz", row, strict=True))
         for t, row in enumerate(xyz, start=1)
     )

@@ -162,9 +162,7 @@ def _walk(
         if kind[0] == "T":
             size, node = _amount(tracer, index, joint, code)
             length = (size * int(sign), node)
-            frame.origin = [
-                tracer.add(o, tracer.mul(w, length)) for o, w in zip(frame.origin, axis, strict=True)
-            ]
+            frame.origin = [tracer.add(o, tracer.mul(w, length)) for o, w in zip(frame.origin, axis, strict=True)]
             continue
         if joint is None and code != GENERAL:
             cos, sin = ((ONE, ZERO), (ZERO, ONE), ((-1, 0), ZERO), (ZERO, (-1, 0)))[code]
@@ -366,9 +364,7 @@ def _lay_out(tracer: _Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -
         for row, (sign, node) in enumerate(outputs)
         if sign == 0 or home[node] != row
     ]
-    scalars = [
-        (*tracer.nodes[n], n) for n in needed if not tracer.is_vector[n] and tracer.nodes[n][0] != "one"
-    ]
+    scalars = [(*tracer.nodes[n], n) for n in needed if not tracer.is_vector[n] and tracer.nodes[n][0] != "one"]
     return Program(
         scalars=tuple(scalars),
         vectors=tuple(vectors),

@@ -110,9 +110,7 @@ class _Reader:
         entry = self.mapping(where, item, ELEMENT_KEYS, required=("type",))
         joint = entry.get("joint")
         if joint is not None and joint not in joint_names:
-            raise FileFormatError(
-                self.path, f"{where}.joint", repr(joint), f"one of: {', '.join(joint_names)}"
-            )
+            raise FileFormatError(self.path, f"{where}.joint", repr(joint), f"one of: {', '.join(joint_names)}")
         parameter = entry.get("parameter")
         try:
             return Element(
@@ -139,9 +137,7 @@ class _Reader:
         self, where: str, item: Any, keys: tuple[str, ...], required: tuple[str, ...] = ()
     ) -> dict[str, Any]:
         if not isinstance(item, Mapping):
-            raise FileFormatError(
-                self.path, where, type(item).__name__, f"a mapping with keys {', '.join(keys)}"
-            )
+            raise FileFormatError(self.path, where, type(item).__name__, f"a mapping with keys {', '.join(keys)}")
         for key in item:
             if key not in keys:
                 raise FileFormatError(self.path, where, f"unknown key {key!r}", f"only: {', '.join(keys)}")

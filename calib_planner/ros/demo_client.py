@@ -106,9 +106,7 @@ class DemoClient:
         """Whether the newest estimate covers the whole plan."""
         return self.identifier_has(plan.plan_id) and bool(self.estimate.complete)  # type: ignore[union-attr]
 
-    def execute(
-        self, plan: PlanMessage, seconds: float, on_progress: Callable[[], None] = lambda: None
-    ) -> None:
+    def execute(self, plan: PlanMessage, seconds: float, on_progress: Callable[[], None] = lambda: None) -> None:
         """Have a plan measured until the estimate covers it; what was missed is done again.
 
         Raises:

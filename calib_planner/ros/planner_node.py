@@ -48,9 +48,7 @@ class PlannerNode(Node):
         self._plan_publisher = self.create_publisher(PlanMessage, "~/current_plan", LATCHED)
         self._trajectory_publisher = self.create_publisher(JointTrajectory, "~/trajectory", LATCHED)
         group = ReentrantCallbackGroup()
-        self._service = self.create_service(
-            PlanService, "~/request_plan", self._on_request, callback_group=group
-        )
+        self._service = self.create_service(PlanService, "~/request_plan", self._on_request, callback_group=group)
         self._action = ActionServer(
             self,
             PlanAction,
@@ -67,9 +65,7 @@ class PlannerNode(Node):
         if self._busy.acquire(timeout=10.0):
             self._busy.release()
 
-    def _on_request(
-        self, request: PlanService.Request, response: PlanService.Response
-    ) -> PlanService.Response:
+    def _on_request(self, request: PlanService.Request, response: PlanService.Response) -> PlanService.Response:
         result = self._work(request, lambda _: self._closing.is_set())
         return self._fill(response, result)
 

@@ -53,9 +53,9 @@ def answer(
     except InputError as error:
         field = re.match(r"\w*", error.field)
         name = field[0] if field else ""
-        return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), str(error))
+        return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), _shortened(str(error)))
     except InfeasibleError as error:
-        return Answer("INFEASIBLE", error.constraint, str(error))
+        return Answer("INFEASIBLE", error.constraint, _shortened(str(error)))
     if found.status == "singular":
         return Answer("INFEASIBLE", "configurations", found.message)
     if found.status == "cancelled":
@@ -71,7 +71,7 @@ def problem_of(request: Any, settings: PlannerParameters, own: Robot) -> PlanPro
         InfeasibleError: No plan can satisfy the request.
     """
     robot = _robot(request, settings, own)
-    poses = check_rows("test_poses", request.test_poses, robot.joint_names)
+    poses = check_rows("test_poses", request.test_poses, robot.joint_names, least=0)
     if len(poses) > settings.most_test_poses:
         raise InputError("test_poses", f"{len(poses)} poses", f"at most {settings.most_test_poses}")
     size = int(request.configurations) or settings.configurations
@@ -102,8 +102,13 @@ def _robot(request: Any, settings: PlannerParameters, own: Robot) -> Robot:
     names = list(request.parameters)
     if len(names) > MOST_PARAMETERS:
         raise InputError("parameters", f"{len(names)} names", f"at most {MOST_PARAMETERS}")
-    wanted = ",".join(names) or settings.parameters
+    wanted = names or settings.parameters
     if request.robot in ("", own.name):
         unknown = [w.strip() for w in settings.unknown.split(",") if w.strip()]
         return own.with_parameters(wanted, unknown)
     return load_shipped(request.robot, wanted, settings.unknown)
+
+
+def _shortened(text: str) -> str:
+    """``text`` without the middle, if what came over the wire made it very long."""
+    return text if len(text) <= 1000 else f"{text[:480]} … {text[-480:]}"

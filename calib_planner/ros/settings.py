@@ -25,9 +25,7 @@ class PlannerParameters:
     parameters: str = parameter("lengths+offsets", LEVEL)
     unknown: str = parameter("", "what else is unknown: base, tool or base,tool")
     criterion: str = parameter("test_pose", "what is optimised, unless the request says otherwise")
-    configurations: int = parameter(
-        12, "configurations of a plan, unless the request says", low=1, high=10000
-    )
+    configurations: int = parameter(12, "configurations of a plan, unless the request says", low=1, high=10000)
     repetitions: int = parameter(1, "measurements at each configuration", low=1, high=10000)
     sigma: float = parameter(3e-5, "noise of one measured coordinate", unit="m", low=1e-9, high=1.0)
     starts: int = parameter(64, "random starts of the search", low=1, high=100000)
@@ -52,9 +50,7 @@ class IdentifierParameters:
         0.0, "noise that averaging does not reduce (robot, reflector)", unit="m", low=0.0, high=1.0
     )
     tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", read_only=True)
-    plan_topic: str = parameter(
-        "calibration_planner/current_plan", "where the plan comes from", read_only=True
-    )
+    plan_topic: str = parameter("calibration_planner/current_plan", "where the plan comes from", read_only=True)
     plan_tolerance: float = parameter(
         0.01, "largest joint difference to a planned configuration", unit="rad or m", low=1e-6, high=1.0
     )
@@ -78,9 +74,7 @@ class IdentifierParameters:
     duration: float = parameter(
         0.4, "standstill: shortest interval averaged", unit="s", low=0.01, high=600.0, read_only=True
     )
-    samples: int = parameter(
-        20, "standstill: points of every target wanted", low=1, high=20000, read_only=True
-    )
+    samples: int = parameter(20, "standstill: points of every target wanted", low=1, high=20000, read_only=True)
     minimum_samples: int = parameter(
         5, "standstill: points of a target needed to use it", low=1, high=20000, read_only=True
     )
@@ -130,9 +124,7 @@ class SimulatorParameters:
         "", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]", read_only=True
     )
     sigma: float = parameter(3e-5, "noise of one coordinate of a tracker point", unit="m", low=0.0, high=1.0)
-    joint_rate: float = parameter(
-        100.0, "rate of joint_states", unit="Hz", low=1.0, high=1000.0, read_only=True
-    )
+    joint_rate: float = parameter(100.0, "rate of joint_states", unit="Hz", low=1.0, high=1000.0, read_only=True)
     tracker_rate: float = parameter(
         50.0, "rate of tracker points", unit="Hz", low=0.1, high=1000.0, read_only=True
     )
@@ -158,7 +150,9 @@ class SimulatorParameters:
         return result
 
 
-def load_shipped(name: str, parameters: str, unknown: str = "", targets: int | None = None) -> Robot:
+def load_shipped(
+    name: str, parameters: str | Sequence[str], unknown: str = "", targets: int | None = None
+) -> Robot:
     """A shipped robot with active parameters; other sources are refused, since names may come from anyone.
 
     Args:

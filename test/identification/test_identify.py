@@ -107,9 +107,7 @@ def test_registration_alone_is_exact_without_noise():
     np.testing.assert_allclose(got.base_pose[0], matrix, atol=1e-10)
     np.testing.assert_allclose(got.base_pose[1], xyz, atol=1e-10)
     np.testing.assert_allclose(got.target_offsets, robot.target_offsets, atol=1e-10)
-    np.testing.assert_allclose(
-        register(mixed(), data, base=True, tool=False).base_pose[0], matrix, atol=1e-10
-    )
+    np.testing.assert_allclose(register(mixed(), data, base=True, tool=False).base_pose[0], matrix, atol=1e-10)
     np.testing.assert_allclose(
         register(blank.with_base(matrix, xyz), data, base=False, tool=True).target_offsets,
         robot.target_offsets,

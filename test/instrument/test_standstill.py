@@ -60,9 +60,7 @@ def feed(
 ) -> list[Standstill | Rejection]:
     results = []
     for stamp, number, value in messages:
-        results += (
-            detector.add_point(number - 1, stamp, value) if number else detector.add_joints(stamp, value)
-        )
+        results += detector.add_point(number - 1, stamp, value) if number else detector.add_joints(stamp, value)
     return results + (detector.flush() if flush else [])
 
 
@@ -138,9 +136,7 @@ def test_a_long_rest_gives_one_result() -> None:
 
 
 def test_slow_motion_is_no_standstill() -> None:
-    messages = [
-        (i * NANO // 100, k, np.full(3 if k else 2, 5e-4 * i / 100)) for i in range(1000) for k in (0, 1)
-    ]
+    messages = [(i * NANO // 100, k, np.full(3 if k else 2, 5e-4 * i / 100)) for i in range(1000) for k in (0, 1)]
     assert not any(isinstance(r, Standstill) for r in feed(StandstillDetector(2), messages))
 
 

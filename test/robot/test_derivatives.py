@@ -55,10 +55,7 @@ def test_jacobian_central_difference(robot, deviations):
 def test_joint_jacobian_complex_step(robot, deviations):
     q = random_configurations(robot, 5)
     expected = np.stack(
-        [
-            complex_positions(robot, q + 1j * STEP * unit, deviations).imag / STEP
-            for unit in np.eye(q.shape[1])
-        ],
+        [complex_positions(robot, q + 1j * STEP * unit, deviations).imag / STEP for unit in np.eye(q.shape[1])],
         axis=-1,
     )
     np.testing.assert_allclose(robot.joint_jacobian(q, deviations), expected, atol=2e-14)

@@ -81,9 +81,7 @@ def test_placement_errors_against_the_kinematic_regressor(pair):
                 arm = data.oMf[tip].act(point) - before.translation
                 turned = -pin.skew(arm) @ before.rotation
                 expected = np.hstack([above.rotation @ bracket, turned])
-                columns = [
-                    robot.parameter_names.index(f"{name}.{e}") for e in ["x", "y", "z", "rx", "ry", "rz"]
-                ]
+                columns = [robot.parameter_names.index(f"{name}.{e}") for e in ["x", "y", "z", "rx", "ry", "rz"]]
                 np.testing.assert_allclose(ours[target][:, columns], expected, atol=1e-13)
                 # Either way the joint's errors move the point in the same six ways.
                 block = regressor[:, 6 * (joint - 1) : 6 * joint]
