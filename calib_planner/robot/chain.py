@@ -25,6 +25,7 @@ from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot.elements import Element, rotation
 from calib_planner.robot.linearisation import Layout, Linearisation
 from calib_planner.robot.parameters import Parameter, resolve_parameters
+from calib_planner.robot.posture import Posture
 from calib_planner.robot.program import Program, compile_program, structure_of
 
 
@@ -218,6 +219,24 @@ class Robot:
         """∂position/∂joint, shape (N, 3·targets, joints) [m/rad | 1], base frame."""
         columns = self.linearise(q, deviations).joint_columns
         return columns.reshape(len(self.joint_names), 3 * len(self.targets), -1).transpose(2, 1, 0)
+
+    def posture(self, q: ArrayLike) -> Posture:
+        """Where joints, tip and targets are: every frame of the chain in one pass; see ``Posture``."""
+        clean = np.ascontiguousarray(self._check_q(q).T)
+        joints, trunk, t = self._layout.joint_elements, len(self.elements), len(self.targets)
+        # A target's branch begins with Tx, Ty, Tz from the tip: their axes are the tip's.
+        axes, origins = (*joints, trunk, trunk + 1, trunk + 2), (*joints, trunk - 1)
+        structure = structure_of(self.elements, self.targets, self._nominal_amounts, (), axes, origins)
+        rows = compile_program(structure).run(clean, self._nominal_amounts)
+        n = len(joints)
+        points = rows.reshape(t + 2 * n + 4, 3, -1).transpose(2, 0, 1)
+        return Posture(
+            targets=points[:, :t],
+            joint_axes=points[:, t : t + n],
+            tip_rotation=points[:, t + n : t + n + 3].transpose(0, 2, 1),
+            joint_origins=points[:, t + n + 3 : t + 2 * n + 3],
+            tip_origin=points[:, -1],
+        )
 
     # ── inside: arrays are clean from here on ────────────────────────────────────────────────────────
 

@@ -47,12 +47,14 @@ class Structure:
         branches: The same for each target, from the tip to the target.
         columns: Flat element indices whose columns are wanted (trunk first, then branch after branch).
         axes: Flat element indices whose axes are wanted.
+        origins: Trunk element indices whose origins are wanted, as they are behind the element.
     """
 
     trunk: tuple[tuple[str, int | None, float, int], ...]
     branches: tuple[tuple[tuple[str, int | None, float, int], ...], ...]
     columns: tuple[int, ...]
     axes: tuple[int, ...]
+    origins: tuple[int, ...] = ()
 
 
 def structure_of(
@@ -61,6 +63,7 @@ def structure_of(
     amounts: NDArray[Any],
     columns: Sequence[int],
     axes: Sequence[int],
+    origins: Sequence[int] = (),
 ) -> Structure:
     """Classify each constant amount (flat order) and describe the chain."""
     elements = [*trunk, *(e for branch in branches for e in branch)]
@@ -69,7 +72,8 @@ def structure_of(
     for branch in branches:
         split.append(tuple(coded[start : start + len(branch)]))
         start += len(branch)
-    return Structure(tuple(coded[: len(trunk)]), tuple(split), tuple(columns), tuple(axes))
+    trunk_code = tuple(coded[: len(trunk)])
+    return Structure(trunk_code, tuple(split), tuple(columns), tuple(axes), tuple(origins))
 
 
 def _code(element: Element, amount: complex) -> int:
@@ -202,7 +206,7 @@ class Program:
         copies: ``(row, sign, slot)``: outputs that are (negated) copies; sign 0 means zero.
         slots: Number of operand slots; the first ``rows`` are the output rows themselves.
         registers: Which scratch register backs each slot beyond the rows and inputs.
-        rows: Number of output rows: positions, columns, axes, in that order.
+        rows: Number of output rows: positions, columns, axes, origins, in that order.
         shape: ``(targets, columns, axes)``.
     """
 
@@ -225,7 +229,7 @@ class Program:
 
         Returns:
             Array of shape (rows, N): positions 3 per target, then 3 per target of each wanted column, then
-            3 of each wanted axis; all in the base frame.
+            3 of each wanted axis, then 3 of each wanted origin; all in the base frame.
         """
         dtype = np.result_type(q.dtype, amounts.dtype, np.float64)
         count = q.shape[1]
@@ -277,6 +281,7 @@ def compile_program(structure: Structure) -> Program:
     tracer = _Tracer()
     frame = _Frame([ZERO] * 3, [[ONE, ZERO, ZERO], [ZERO, ONE, ZERO], [ZERO, ZERO, ONE]])
     seen = _walk(tracer, frame, structure.trunk, 0)
+    behind = [origin for _, origin, _ in seen[1:]] + [list(frame.origin)]
     owner: list[int | None] = [None] * len(seen)
     points = []
     for target, branch in enumerate(structure.branches):
@@ -298,6 +303,8 @@ def compile_program(structure: Structure) -> Program:
     for e in structure.axes:
         sign = _element_sign(structure, e)
         outputs += [(sign * s, n) for s, n in seen[e][0]]
+    for e in structure.origins:
+        outputs += behind[e]
     return _lay_out(tracer, outputs, (len(points), len(structure.columns), len(structure.axes)))
 
 
