@@ -92,8 +92,9 @@ class Accuracy(_Smooth):
     def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(matrices)
         half = inverse @ self.weight
-        worth: FloatArray = np.asarray(1.0 / np.trace(half, axis1=1, axis2=2), np.float64)
-        return worth, _symmetric((worth**2)[:, None, None] * (half @ inverse))
+        worth = 1.0 / np.einsum("sii->s", half)
+        slope: FloatArray = (worth**2)[:, None, None] * (half @ inverse)
+        return worth, _symmetric(slope)
 
 
 @dataclass(frozen=True)

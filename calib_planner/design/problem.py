@@ -64,7 +64,7 @@ class PlanProblem:
     sigma: float = 3e-5
     criterion: str = "test_pose"
     compound: Mapping[str, float] = field(default_factory=dict)
-    general_weight: float = 1e-4
+    general_weight: float = 5e-5
     noise: Noise | None = None
     configuration_sigma: float = 0.0
     prior_std: Mapping[str, float] = field(default_factory=dict)

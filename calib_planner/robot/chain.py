@@ -265,7 +265,20 @@ class Robot:
     def _nominal_amounts(self) -> FloatArray:
         return frozen(np.array([e.value for e in self._flat]))
 
+    @cached_property
+    def _nominal_programs(self) -> dict[tuple[int, ...], Program]:
+        return {}
+
     def _program(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
+        """The compiled chain; those of the nominal robot are remembered by what they compute."""
+        if amounts is self._nominal_amounts:
+            key = (*columns, -1, *axes)
+            if key not in self._nominal_programs:
+                self._nominal_programs[key] = self._compile(amounts, columns, axes)
+            return self._nominal_programs[key]
+        return self._compile(amounts, columns, axes)
+
+    def _compile(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
         return compile_program(structure_of(self.elements, self.targets, amounts, columns, axes))
 
     def _amounts(self, deviations: NDArray[Any]) -> NDArray[Any]:

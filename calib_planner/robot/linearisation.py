@@ -15,10 +15,11 @@ the gradient in q into running sums over the parameters in chain order, no secon
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,16 @@ class Layout:
     parameter_rotates: tuple[bool, ...]
     joint_elements: tuple[int, ...]
     joint_rotates: tuple[bool, ...]
+
+    @cached_property
+    def running_sums(self) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+        """What ``pull_back`` needs: parameters in chain order; places of the rotations in that order; for each
+        joint the number of parameters in front of it; 1 for joints that turn, 0 for those that slide."""
+        elements = np.array(self.parameter_elements, np.int64)
+        order = np.argsort(elements, kind="stable")
+        front = np.flatnonzero(np.array(self.parameter_rotates, bool)[order])
+        before = np.searchsorted(elements[order], np.array(self.joint_elements), side="left")
+        return order, front, before, np.array(self.joint_rotates, float)
 
 
 @dataclass(frozen=True)
@@ -87,28 +98,29 @@ class Linearisation:
             (N, joints), ∂f/∂q.
         """
         lay = self.layout
-        n = self.points.shape[-1]
-        order = sorted(range(len(lay.parameter_elements)), key=lambda a: lay.parameter_elements[a])
-        twist = np.zeros((3, n))
-        for a in order:
-            twist += _cross(self.columns[a], weights[a]).sum(axis=0)
-        front = np.zeros_like(self.points)
-        gradient = np.empty((len(lay.joint_elements), n))
-        queue = list(order)
-        for k in sorted(range(len(lay.joint_elements)), key=lambda j: lay.joint_elements[j]):
-            while queue and lay.parameter_elements[queue[0]] < lay.joint_elements[k]:
-                a = queue.pop(0)
-                twist -= _cross(self.columns[a], weights[a]).sum(axis=0)
-                if lay.parameter_rotates[a]:
-                    front += _cross(weights[a], self.parameter_axes[a])
-            gradient[k] = (self.joint_columns[k] * front).sum(axis=(0, 1))
-            if lay.joint_rotates[k]:
-                gradient[k] += (self.joint_axes[k] * twist).sum(axis=0)
+        order, front, before, turning = lay.running_sums
+        # Running sums from the tip: Σ J_a × G_a over the parameters at or behind each place of the chain.
+        twists = _cross(self.columns, weights).sum(axis=1)[order]
+        behind = np.zeros((len(order) + 1, *twists.shape[1:]))
+        np.cumsum(twists[::-1], axis=0, out=behind[1:])
+        gradient = (self.joint_axes * behind[len(order) - before]).sum(axis=1) * turning[:, None]
+        if front.size:
+            # Running sums from the base: Σ G_a × w_a over the rotations in front of each place.
+            pushes = _cross(weights[order][front], self.parameter_axes[order][front][:, None])
+            ahead = np.zeros((len(front) + 1, *pushes.shape[1:]))
+            np.cumsum(pushes, axis=0, out=ahead[1:])
+            rotations = np.searchsorted(front, before)
+            gradient += (self.joint_columns * ahead[rotations]).sum(axis=(1, 2))
         return gradient.T
 
 
 def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Cross product over the axis before the last; broadcasts (3, N) against (targets, 3, N)."""
+    """Cross product over the axis before the last; the other axes broadcast."""
     ux, uy, uz = u[..., 0, :], u[..., 1, :], u[..., 2, :]
     vx, vy, vz = v[..., 0, :], v[..., 1, :], v[..., 2, :]
-    return np.stack((uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx), axis=-2)
+    first = uy * vz
+    out = np.empty((*first.shape[:-1], 3, first.shape[-1]))
+    np.subtract(first, uz * vy, out=out[..., 0, :])
+    np.subtract(uz * vx, ux * vz, out=out[..., 1, :])
+    np.subtract(ux * vy, uy * vx, out=out[..., 2, :])
+    return out

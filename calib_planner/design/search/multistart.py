@@ -29,6 +29,8 @@ from calib_planner.design.search.descent import Descent, Objective, descend
 RIDGE = 1e-12
 """Added to the information of a plan, relative to its diagonal, so that singular plans stay finite."""
 CHUNKS = 4
+FINALISTS = 3
+"""Plans of each chunk that are polished to the end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +95,13 @@ def search_chunk(
     """One part of the work: ``starts`` descents, the best of them."""
     size = problem.size
     rows, used = _starts(problem, starts, rng, stop)
-    final = _descend_from(problem, size, rows, stop, 150)
+    rough = _descend_from(problem, size, rows, stop, 80, 1e-4)
+    finalists = rough.x[np.argsort(rough.value)[:FINALISTS]]
+    final = _descend_from(problem, size, finalists, stop, 200, 1e-7)
     best = int(np.argmin(final.value))
     configurations = final.x[best].reshape(size, -1)
-    return SearchResult(configurations, -float(final.value[best]), starts, used + final.evaluations)
+    work = used + rough.evaluations + final.evaluations
+    return SearchResult(configurations, -float(final.value[best]), starts, work)
 
 
 def _starts(
@@ -113,7 +118,7 @@ def _starts(
     tiled = -(-starts // 3) if kernel_size < size else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
-        kernel = _descend_from(problem, kernel_size, first, stop, 100)
+        kernel = _descend_from(problem, kernel_size, first, stop, 80, 1e-4)
         evaluations += kernel.evaluations
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
@@ -138,7 +143,12 @@ def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) 
 
 
 def _descend_from(
-    problem: SearchProblem, size: int, rows: FloatArray, stop: Callable[[], bool], iterations: int
+    problem: SearchProblem,
+    size: int,
+    rows: FloatArray,
+    stop: Callable[[], bool],
+    iterations: int,
+    tolerance: float,
 ) -> Descent:
     low, high = problem.model.robot.joint_limits.T
     return descend(
@@ -147,6 +157,6 @@ def _descend_from(
         np.tile(low, size),
         np.tile(high, size),
         iterations=iterations,
-        tolerance=1e-6,
+        tolerance=tolerance,
         stop=stop,
     )
