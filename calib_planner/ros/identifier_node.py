@@ -44,6 +44,8 @@ from calib_planner.ros.settings import IdentifierParameters, load_shipped
 class IdentifierNode(Node):
     """See the module."""
 
+    THREADS = 1
+
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("calibration_identifier", context=context, parameter_overrides=list(overrides))
         self.settings = NodeParameters(self, IdentifierParameters())
@@ -207,7 +209,7 @@ def _robot(settings: IdentifierParameters, parameters: str) -> Robot:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is told to end."""
-    return run(IdentifierNode, 2, args)
+    return run(IdentifierNode, IdentifierNode.THREADS, args)
 
 
 if __name__ == "__main__":

@@ -38,6 +38,8 @@ FEEDBACK_PERIOD = 0.1
 class PlannerNode(Node):
     """See the module."""
 
+    THREADS = 4
+
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("calibration_planner", context=context, parameter_overrides=list(overrides))
         self.settings = NodeParameters(self, PlannerParameters())
@@ -59,11 +61,13 @@ class PlannerNode(Node):
         )
         self.get_logger().info(f"ready to plan for {self._robot.name}")
 
-    def close(self) -> None:
-        """End a search that is under way."""
+    def close(self) -> bool:
+        """End a search that is under way; whether it did within a moment."""
         self._closing.set()
-        if self._busy.acquire(timeout=10.0):
+        ended = self._busy.acquire(timeout=4.0)
+        if ended:
             self._busy.release()
+        return ended
 
     def _on_request(self, request: PlanService.Request, response: PlanService.Response) -> PlanService.Response:
         result = self._work(request, lambda _: self._closing.is_set())
@@ -148,7 +152,7 @@ def feedback_message(state: Progress) -> PlanAction.Feedback:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is told to end."""
-    return run(PlannerNode, 4, args)
+    return run(PlannerNode, PlannerNode.THREADS, args)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.node import Node
 
 from calib_planner.errors import CalibPlannerError
@@ -19,6 +25,10 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
 
     rclpy's own handlers shut the context down, which ends the spinning. Python's are replaced, so that a
     second Ctrl-C during the clean-up does no harm.
+
+    Args:
+        threads: 1 for a node whose callbacks are all short: rclpy's executor of many threads costs several
+            times the processor time per message.
 
     Returns:
         Exit status.
@@ -32,7 +42,7 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         if asked:
             return 0
         node = make()
-        executor = MultiThreadedExecutor(num_threads=threads)
+        executor = _executor(threads)
         executor.add_node(node)
         while rclpy.ok() and not asked:
             executor.spin_once()
@@ -44,6 +54,12 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         return 1
     finally:
         close = getattr(node, "close", None)
-        if close is not None:
-            close()
+        ended = close() if close is not None else True
         rclpy.try_shutdown()
+        if not ended:
+            # Python would wait for the thread that is still at work.
+            os._exit(0)
+
+
+def _executor(threads: int) -> Executor:
+    return SingleThreadedExecutor() if threads == 1 else MultiThreadedExecutor(num_threads=threads)

@@ -53,6 +53,8 @@ class Execution:
 class SimulatorNode(Node):
     """See the module."""
 
+    THREADS = 3
+
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("tracker_simulator", context=context, parameter_overrides=list(overrides))
         self.settings = NodeParameters(self, SimulatorParameters())
@@ -84,9 +86,13 @@ class SimulatorNode(Node):
         )
         self.get_logger().info(f"{self._robot.name} with hidden errors stands still")
 
-    def close(self) -> None:
-        """End an execution that is under way."""
+    def close(self) -> bool:
+        """End an execution that is under way; whether it did within a moment."""
         self._closing.set()
+        ended = self._busy.acquire(timeout=2.0)
+        if ended:
+            self._busy.release()
+        return ended
 
     # ── the world ────────────────────────────────────────────────────────────────────────────────────
 
@@ -200,7 +206,7 @@ def check_executable(plan: Plan, robot: Robot) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is told to end."""
-    return run(SimulatorNode, 3, args)
+    return run(SimulatorNode, SimulatorNode.THREADS, args)
 
 
 if __name__ == "__main__":

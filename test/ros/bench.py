@@ -1,0 +1,130 @@
+"""A context of its own with the node under test and a client node, spun in a thread.
+
+Nothing sleeps and hopes: ``wait`` waits for a condition up to a deadline, and calls are repeated because an
+answer can be published before discovery has matched its reader.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+
+DOMAIN = 1 + (os.getpid() * 53 + 11) % 100
+
+
+def overrides(values: Mapping[str, Any]) -> list[Parameter]:
+    return [Parameter(k, value=v) for k, v in values.items()]
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.context = Context()
+        rclpy.init(args=[], context=self.context, domain_id=DOMAIN)
+        self.client = Node("test_client", context=self.context)
+        self.nodes: list[Node] = []
+        self.actions: list[ActionClient] = []
+        self.stopping = False
+        self._spinning: list[tuple[Executor, threading.Thread]] = []
+        self._spin(self.client, 1)
+
+    def _spin(self, node: Node, threads: int) -> None:
+        """Spin the node by an executor and in a thread of its own."""
+        kind = SingleThreadedExecutor if threads == 1 else MultiThreadedExecutor
+        executor = kind(context=self.context)
+        executor.add_node(node)
+
+        def work() -> None:
+            while self.context.ok() and not self.stopping:
+                try:
+                    executor.spin_once(timeout_sec=0.1)
+                except ExternalShutdownException:
+                    return
+
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        self._spinning.append((executor, thread))
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for node in self.nodes:
+            node.close() if hasattr(node, "close") else None
+        self.stopping = True
+        for executor, thread in self._spinning:
+            executor.wake()
+            thread.join(timeout=10.0)
+        for executor, _ in self._spinning:
+            executor.shutdown()
+        for client in self.actions:
+            client.destroy()
+        # Without this the DDS participant lives on: beyond some 30 of them discovery fails.
+        for node in (*self.nodes, self.client):
+            node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def start(self, kind: Callable[..., Node], **parameters: Any) -> Any:
+        node = kind(context=self.context, overrides=overrides(parameters))
+        self.nodes.append(node)
+        self._spin(node, getattr(kind, "THREADS", 1))
+        return node
+
+    def wait(self, condition: Callable[[], Any], seconds: float = 15.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, f"not within {seconds} s"
+            time.sleep(0.005)
+
+    def future(self, future: Any, seconds: float = 15.0) -> Any:
+        self.wait(future.done, seconds)
+        return future.result()
+
+    def call(self, kind: Any, name: str, request: Any, seconds: float = 10.0, attempts: int = 3) -> Any:
+        client = self.client.create_client(kind, name)
+        try:
+            self.wait(client.service_is_ready)
+            for attempt in range(attempts):
+                future = client.call_async(request)
+                try:
+                    return self.future(future, seconds)
+                except AssertionError:
+                    client.remove_pending_request(future)
+                    if attempt == attempts - 1:
+                        raise
+        finally:
+            self.client.destroy_client(client)
+
+    def action(self, kind: Any, name: str) -> ActionClient:
+        client = ActionClient(self.client, kind, name)
+        self.actions.append(client)
+        self.wait(client.server_is_ready)
+        return client
+
+    def goal(self, client: ActionClient, goal: Any, **options: Any) -> Any:
+        """The handle of an accepted goal."""
+        for _ in range(3):
+            sent = client.send_goal_async(goal, **options)
+            try:
+                handle = self.future(sent, 5.0)
+            except AssertionError:
+                continue
+            assert handle.accepted
+            return handle
+        raise AssertionError("goal not answered")
+
+    def hear(self, kind: Any, topic: str, qos: QoSProfile) -> list[Any]:
+        """A list that grows with the messages of a topic."""
+        heard: list[Any] = []
+        self.client.create_subscription(kind, topic, heard.append, qos)
+        return heard

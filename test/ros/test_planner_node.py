@@ -1,0 +1,115 @@
+"""The planner node over real topics, services and actions, in this process."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from bench import Bench
+from calib_planner_msgs.action import PlanCalibration as PlanAction
+from calib_planner_msgs.msg import Plan as PlanMessage
+from calib_planner_msgs.srv import PlanCalibration
+from rcl_interfaces.srv import GetParameters
+from trajectory_msgs.msg import JointTrajectory
+
+from calib_planner.ros.planner_node import PlannerNode
+from calib_planner.ros.qos import LATCHED
+
+SERVICE, ACTION = "calibration_planner/request_plan", "calibration_planner/plan"
+POSE = [0.3, 0.5]
+Response = PlanCalibration.Response
+KUKA_POSE = [0.0, -1.0, 1.5, 0.0, 0.8, 0.0]
+
+
+def request(**changes: Any) -> PlanCalibration.Request:
+    return PlanCalibration.Request(**({"test_poses": POSE, "configurations": 4} | changes))
+
+
+def long_goal() -> PlanAction.Goal:
+    return PlanAction.Goal(robot="kuka_kr270", test_poses=KUKA_POSE, configurations=20, time_limit=60.0)
+
+
+def test_a_plan_by_service_reaches_late_joiners(bench: Bench) -> None:
+    bench.start(PlannerNode, robot="planar_2r", starts=4)
+    answer = bench.call(PlanCalibration, SERVICE, request(seed=5))
+    assert answer.status == Response.SUCCESS and answer.plan.status == PlanMessage.STATUS_OK
+    assert len(answer.plan.configurations) == 8 and answer.plan.seed == 5 and answer.plan.plan_id
+    assert 0 < answer.plan.lower_bound <= answer.plan.predicted_accuracy * (1 + 1e-9)
+    plans = bench.hear(PlanMessage, "calibration_planner/current_plan", LATCHED)
+    paths = bench.hear(JointTrajectory, "calibration_planner/trajectory", LATCHED)
+    bench.wait(lambda: plans and paths)
+    assert plans[0] == answer.plan
+    assert np.allclose(np.ravel([p.positions for p in paths[0].points]), answer.plan.configurations)
+
+
+def test_bad_requests_one_after_the_other(bench: Bench) -> None:
+    bench.start(PlannerNode, robot="planar_2r", starts=4)
+    bad = {
+        "test_poses": [{"test_poses": x} for x in ([], [1.0], [math.nan, 0.0], [9.0, 0.0], [0.0] * 50_000)],
+        "robot": [{"robot": x} for x in ("none", "/etc/passwd", "x" * 10_000, "planar_2r.yaml")],
+        "parameters": [{"parameters": x} for x in (["none"], ["l1", "l1"], [""], ["a"] * 5000)],
+        "criterion": [{"criterion": "none"}],
+        "test_pose_weights": [{"test_pose_weights": x} for x in ([1.0, 2.0], [-1.0], [math.inf])],
+        "sigma": [{"sigma": x} for x in (-1.0, math.nan)],
+        "time_limit": [{"time_limit": math.nan}],
+        "configurations": [{"configurations": 4_000_000_000}],
+    }
+    for field, changes in bad.items():
+        for change in changes:
+            answer = bench.call(PlanCalibration, SERVICE, request(**change))
+            assert answer.status == Response.INVALID_REQUEST, change
+            assert answer.field == field and answer.message
+            assert answer.plan.status == PlanMessage.STATUS_EMPTY
+    answer = bench.call(PlanCalibration, SERVICE, request(configurations=1))
+    assert (answer.status, answer.field) == (Response.INFEASIBLE, "configurations")
+    assert bench.call(PlanCalibration, SERVICE, request()).status == Response.SUCCESS
+
+
+def test_an_unforeseen_fault_is_answered(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("made for this test")
+
+    bench.start(PlannerNode, robot="planar_2r", starts=4)
+    with monkeypatch.context() as patch:
+        patch.setattr("calib_planner.ros.planner_node.answer", broken)
+        answer = bench.call(PlanCalibration, SERVICE, request())
+    assert answer.status == Response.INTERNAL_ERROR and "made for this test" in answer.message
+    assert bench.call(PlanCalibration, SERVICE, request()).status == Response.SUCCESS
+
+
+def test_while_it_plans_it_answers_and_can_be_cancelled(bench: Bench) -> None:
+    bench.start(PlannerNode, robot="planar_2r", starts=20_000)
+    client = bench.action(PlanAction, ACTION)
+    feedback: list[Any] = []
+    handle = bench.goal(client, long_goal(), feedback_callback=feedback.append)
+    bench.wait(lambda: feedback)
+    busy = bench.call(PlanCalibration, SERVICE, request())
+    assert busy.status == Response.BUSY and "again later" in busy.message
+    began = time.monotonic()
+    name = "calibration_planner/get_parameters"
+    assert bench.call(GetParameters, name, GetParameters.Request(names=["sigma"])).values
+    assert time.monotonic() - began < 5.0
+    cancelled = bench.future(handle.cancel_goal_async())
+    assert len(cancelled.goals_canceling) == 1
+    result = bench.future(handle.get_result_async(), 60.0)
+    assert result.status == GoalStatus.STATUS_CANCELED
+    assert result.result.status == PlanAction.Result.CANCELLED
+    assert len(result.result.plan.configurations) == 120
+    assert result.result.plan.status == PlanMessage.STATUS_CANCELLED
+    assert feedback[0].feedback.starts_total == 20_000
+    assert bench.call(PlanCalibration, SERVICE, request(time_limit=0.5)).status == Response.SUCCESS
+
+
+@pytest.mark.parametrize(("pose", "status"), [(POSE, "SUCCESS"), ([math.nan, 0.0], "INVALID_REQUEST")])
+def test_the_action_answers_like_the_service(bench: Bench, pose: list[float], status: str) -> None:
+    bench.start(PlannerNode, robot="planar_2r", starts=4)
+    handle = bench.goal(bench.action(PlanAction, ACTION), PlanAction.Goal(test_poses=pose))
+    result = bench.future(handle.get_result_async(), 20.0)
+    good = status == "SUCCESS"
+    assert result.status == (GoalStatus.STATUS_SUCCEEDED if good else GoalStatus.STATUS_ABORTED)
+    assert result.result.status == getattr(PlanAction.Result, status)
+    assert bool(result.result.plan.configurations) == good

@@ -1,0 +1,106 @@
+"""The real thing: planner, identifier and simulator as processes, DDS between them, truth hidden in one."""
+
+from __future__ import annotations
+
+import math
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calib_planner_msgs.msg import CalibrationEstimate
+from calib_planner_msgs.srv import PlanCalibration
+
+from calib_planner import Robot
+from calib_planner.ros import demo
+from calib_planner.ros.conversions import estimate_from_message
+from calib_planner.ros.demo_client import DemoClient
+from calib_planner.ros.processes import Nodes, ProcessFailed, node_names, own_domain
+from calib_planner.simulation import random_deviations
+
+SEED = 11
+DOMAIN = own_domain()
+
+
+def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
+    with Nodes(tmp_path, DOMAIN) as nodes:
+        nodes.start("planner_node", {"starts": 16})
+        nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
+        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7})
+        client = DemoClient(DOMAIN, nodes.check)
+        try:
+            request = PlanCalibration.Request(
+                robot="kuka_kr270",
+                parameters=["lengths+offsets"],
+                test_poses=[math.radians(x) for x in (0, -60, 90, 0, 45, 0)],
+                configurations=6,
+                sigma=3e-5 / math.sqrt(20),
+                seed=SEED,
+            )
+            plan = client.request_plan(request)
+            client.wait(lambda: client.identifier_has(plan.plan_id), 20.0, "estimate")
+            client.execute(plan, 60.0)
+            final = client.estimate
+            assert final is not None
+            assert client.save().startswith("saved ")
+        finally:
+            client.close()
+        assert nodes.end(signal.SIGINT) == dict.fromkeys(node_names(), 0), nodes.logs()
+        for name, text in nodes.logs().items():
+            assert "Traceback" not in text, (name, text)
+    assert final.status == CalibrationEstimate.STATUS_OK and final.complete
+    found = estimate_from_message(final)
+    robot = Robot.load("kuka_kr270").with_parameters("lengths+offsets")
+    truth = random_deviations(robot, SEED)
+    off = found.deviations - [truth[n] for n in found.parameters]
+    assert found.parameters == robot.parameter_names
+    assert (np.abs(off) < 4 * found.std).all(), off / found.std
+    assert len(list(tmp_path.glob("measurements_*.csv"))) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
+    with Nodes(tmp_path, DOMAIN) as nodes:
+        nodes.start("planner_node", {"starts": 5000})
+        client = DemoClient(DOMAIN, nodes.check)
+        try:
+            client.wait(client._plan.service_is_ready, 20.0, "service")
+            pose = [0.0, -1.0, 1.5, 0.0, 0.8, 0.0]
+            client._plan.call_async(PlanCalibration.Request(test_poses=pose, configurations=12))
+            busy = PlanCalibration.Request(test_poses=pose, configurations=3)
+
+            def planning() -> bool:
+                future = client._plan.call_async(busy)
+                client.wait(future.done, 3.0)
+                return future.done() and future.result().status == PlanCalibration.Response.BUSY
+
+            client.wait(planning, 20.0, "refusal")
+        finally:
+            client.close()
+        assert nodes.end(number) == {"planner_node": 0}, nodes.logs()
+        assert "Traceback" not in nodes.logs()["planner_node"]
+
+
+def test_a_node_that_fails_is_reported(tmp_path: Path) -> None:
+    with Nodes(tmp_path, DOMAIN) as nodes:
+        nodes.start("planner_node", {"robot": "none"})
+        client = DemoClient(DOMAIN, nodes.check)
+        try:
+            with pytest.raises(ProcessFailed, match="planner_node ended with status 1") as caught:
+                client.wait(lambda: False, 20.0)
+        finally:
+            client.close()
+    assert "planar_2r" in str(caught.value) and "Traceback" not in str(caught.value)
+
+
+@pytest.mark.parametrize("option", [["--configurations", "0"], ["--seed", "-1"], ["--none"], ["--seed", "a"]])
+def test_wrong_use_of_the_demo(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        demo.main(option)
+    assert caught.value.code == 2 and capsys.readouterr().err
+
+
+def test_a_demo_that_cannot_be_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert demo.main(["--configurations", "1", "--json", "--output", str(tmp_path)]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == "" and "configurations" in shown.err and "Traceback" not in shown.err
