@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -159,6 +160,7 @@ def main(args: Sequence[str] | None = None) -> int:
         parser.error("--configurations: a whole number from 1 to 200")
     if not 0 <= chosen.seed < 2**31:
         parser.error("--seed: a whole number from 0 to 2147483647")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the nodes, as Ctrl-C does
     screen = Screen()
     try:
         result = run_demo(Options(chosen.configurations, chosen.seed, chosen.output), screen)

@@ -6,8 +6,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -89,6 +91,10 @@ class Nodes:
 
     def end(self, number: signal.Signals = signal.SIGINT) -> dict[str, int]:
         """End all nodes; returns the exit status of each (negative: had to be killed)."""
+        with _undisturbed():
+            return self._end(number)
+
+    def _end(self, number: signal.Signals) -> dict[str, int]:
         running = [c for c in self._children if c.process.poll() is None]
         for child in running:
             child.process.send_signal(number)
@@ -112,6 +118,19 @@ class Nodes:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.end()
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ctrl-C waits: a second one must not leave nodes behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def node_names() -> Sequence[str]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -104,3 +107,29 @@ def test_a_demo_that_cannot_be_done(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert demo.main(["--configurations", "1", "--json", "--output", str(tmp_path)]) == 1
     shown = capsys.readouterr()
     assert shown.out == "" and "configurations" in shown.err and "Traceback" not in shown.err
+
+
+def running_with(text: str) -> list[str]:
+    """Command lines of processes that name ``text``."""
+    lines = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            lines.append(path.read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+        except OSError:
+            continue
+    return [line for line in lines if text in line]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
+    command = [sys.executable, "-m", "calib_planner.ros.demo", "--output", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo_process:
+        deadline = time.monotonic() + 30.0
+        while "ready to identify" not in "".join(p.read_text() for p in tmp_path.glob("log/identifier*")):
+            assert time.monotonic() < deadline and demo_process.poll() is None
+            time.sleep(0.05)
+        demo_process.send_signal(number)
+        out, err = demo_process.communicate(timeout=30.0)
+    assert demo_process.returncode == 130
+    assert out == "" and "interrupted" in err and "Traceback" not in err
+    assert not running_with(str(tmp_path))

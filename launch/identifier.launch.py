@@ -1,0 +1,34 @@
+"""Starts calibration_identifier with config/identifier.yaml.
+
+    ros2 launch calib_planner identifier.launch.py
+    ros2 launch calib_planner identifier.launch.py namespace:=cell_1 parameters:=/path/to/my.yaml
+
+A file given as ``parameters`` needs only what differs; what there is, with units and ranges, is in
+config/identifier.yaml.
+"""
+
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
+
+
+def generate_launch_description() -> LaunchDescription:
+    """What ``ros2 launch`` runs."""
+    default = PathJoinSubstitution([FindPackageShare("calib_planner"), "config", "identifier.yaml"])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
+            DeclareLaunchArgument("parameters", default_value=default, description="YAML of node parameters"),
+            Node(
+                package="calib_planner",
+                executable="identifier_node",
+                name="calibration_identifier",
+                namespace=LaunchConfiguration("namespace"),
+                parameters=[default, LaunchConfiguration("parameters")],
+                output="screen",
+            ),
+        ]
+    )
