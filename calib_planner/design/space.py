@@ -6,7 +6,7 @@ matrix below is invertible for some plan. What is known beforehand enters as M_0
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         )
     prior = prior_rows.T @ prior_rows
     _check_enough(problem, jacobians[:, :, kept], prior[np.ix_(kept, kept)])
-    robot = problem.robot.with_parameters([names[i] for i in kept])
+    robot = replace(problem.robot, joint_limits=feasibility.limits).with_parameters([names[i] for i in kept])
     interest = tuple(
         i for i, n in enumerate(robot.parameter_names) if not n.startswith(("base.", "target_"))
     ) or tuple(range(len(kept)))
@@ -135,6 +135,7 @@ def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArra
     if problem.candidates is None:
         return feasibility.sample(rng, SAMPLE)
     pool = np.asarray(problem.candidates)
+    feasibility.check_pool(pool, 1 if problem.repeat_candidates else problem.configurations)
     return pool if len(pool) <= SAMPLE else pool[rng.choice(len(pool), SAMPLE, replace=False)]
 
 
@@ -156,10 +157,7 @@ def _prior_rows(problem: PlanProblem) -> FloatArray:
 
 def _check_enough(problem: PlanProblem, jacobians: FloatArray, prior: FloatArray) -> None:
     """Refuse what so few configurations cannot identify, whichever they are."""
-    known = int(np.linalg.matrix_rank(prior)) if prior.any() else 0
-    unknown = jacobians.shape[2] - known
-    per_row = max(int(np.linalg.matrix_rank(j)) for j in jacobians[:8])
-    needed = -(-unknown // per_row)
+    needed, per_row, unknown = _needed(jacobians, prior)
     if problem.configurations < needed:
         raise InfeasibleError(
             "configurations",
@@ -167,3 +165,18 @@ def _check_enough(problem: PlanProblem, jacobians: FloatArray, prior: FloatArray
             f"{problem.configurations * per_row} equations for {unknown} identifiable parameters; ask for "
             f"at least {needed}, or for fewer parameters",
         )
+
+
+def _needed(jacobians: FloatArray, prior: FloatArray) -> tuple[int, int, int]:
+    """Configurations needed, equations that each gives, parameters that are not known beforehand."""
+    known = int(np.linalg.matrix_rank(prior)) if prior.any() else 0
+    unknown = jacobians.shape[2] - known
+    per_row = max(int(np.linalg.matrix_rank(j)) for j in jacobians[:8])
+    return -(-unknown // per_row), per_row, unknown
+
+
+def smallest_size(problem: PlanProblem) -> int:
+    """The smallest number of configurations that could identify the problem's parameters, at least 1."""
+    space = plan_space(replace(problem, configurations=len(problem.robot.parameter_names)))
+    q = _representative(problem, space.feasibility)[:8]
+    return max(_needed(np.ascontiguousarray(space.robot.jacobian(q)), space.prior)[0], 1)
