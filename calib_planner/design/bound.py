@@ -24,7 +24,9 @@ from calib_planner._arrays import FloatArray
 from calib_planner.design.criteria import Criterion
 from calib_planner.design.feasibility import Feasibility
 from calib_planner.design.information import InformationModel
+from calib_planner.design.pool_bound import relax_pool
 from calib_planner.design.search.descent import Descent, descend
+from calib_planner.errors import InfeasibleError
 
 SPREAD = 256
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
@@ -44,6 +46,7 @@ class RelaxedProblem:
         measurements: n.
         feasibility: Where measuring is possible.
         pool: (C, joints) the only configurations there are, or ``None`` for all within the limits.
+        distinct: Number of rows of the pool if each may be chosen once only.
     """
 
     model: InformationModel
@@ -52,6 +55,7 @@ class RelaxedProblem:
     measurements: int
     feasibility: Feasibility
     pool: FloatArray | None = None
+    distinct: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +88,7 @@ def relaxed_design(
 ) -> RelaxedDesign:
     """Grow a discrete measure until the bound is within ``gap`` of its worth."""
     if problem.pool is not None:
-        return _relaxed_pool(problem, problem.pool)
+        return _relaxed_pool(problem, problem.pool, stop)
     model, n = problem.model, problem.measurements
     everywhere = model.at(problem.feasibility.sample(rng, SPREAD)).mean(axis=0)
     support: FloatArray = np.concatenate([start, problem.feasibility.sample(rng, 16)])
@@ -112,23 +116,14 @@ def relaxed_design(
     return best
 
 
-def _relaxed_pool(problem: RelaxedProblem, pool: FloatArray, gap: float = 2e-3) -> RelaxedDesign:
-    """The same over a finite pool: every d is computed, so the bound is exact."""
+def _relaxed_pool(problem: RelaxedProblem, pool: FloatArray, stop: Callable[[], bool]) -> RelaxedDesign:
+    """The same over a finite pool: every d is computed, so the bound is exact (see ``pool_bound``)."""
     q = pool[problem.feasibility.mask(pool)]
-    unit = problem.measurements * problem.model.at(q)
-    weights: FloatArray = np.full(len(q), 1.0 / len(q))
-    best: RelaxedDesign | None = None
-    for _ in range(30):
-        weights, matrix = _multiplicative(problem.criterion, unit, weights, problem.prior, 20)
-        slope = problem.criterion.supporting_slope(matrix)
-        worth = problem.criterion.exact(matrix)
-        ceiling = float(np.sum(slope * problem.prior))
-        ceiling += float((unit.reshape(len(unit), -1) @ slope.ravel()).max())
-        best = _better(best, RelaxedDesign(worth, max(ceiling, worth), q, weights, slope))
-        if best.worth >= (1.0 - gap) * best.bound:
-            break
-    assert best is not None
-    return best
+    if not len(q):
+        raise InfeasibleError("candidates", "no row of the pool satisfies the constraints")
+    rows = problem.model.whitened(q)
+    found = relax_pool(rows, problem.criterion, problem.prior, problem.measurements, problem.distinct, stop)
+    return RelaxedDesign(found.worth, found.bound, q, found.weights, found.slope)
 
 
 def _better(best: RelaxedDesign | None, new: RelaxedDesign) -> RelaxedDesign:

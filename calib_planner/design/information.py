@@ -53,6 +53,15 @@ class InformationModel:
         jacobian = np.ascontiguousarray(jacobian)
         return np.swapaxes(jacobian, 1, 2) @ self._weigh(points, jacobian)
 
+    def whitened(self, q: FloatArray) -> FloatArray:
+        """Rows W^½ J with I(q) = rowsᵀ rows: (N, joints) → (N, 3·targets, p)."""
+        points, jacobian = self.robot.positions_and_jacobian(q)
+        jacobian = np.ascontiguousarray(jacobian)
+        if isinstance(self.noise, Isotropic):
+            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2)
+        whitener = np.linalg.inv(np.linalg.cholesky(self._covariance(points)))
+        return (whitener @ jacobian.reshape(*points.shape, -1)).reshape(jacobian.shape)
+
     def linearised(self, q: FloatArray) -> LinearisedInformation:
         """The same with what its gradient needs."""
         lin = self.robot._linearise(q, np.zeros(len(self.robot.parameter_names)))

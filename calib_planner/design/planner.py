@@ -74,7 +74,7 @@ def plan(problem: PlanProblem, callback: Callback | None = None, executor: Execu
     relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
     clock.tell(bound=relaxed.bound if relaxed else None)
     if problem.candidates is not None:
-        found = _choose(space, criterion, rng, clock)
+        found = _choose(space, criterion, relaxed, rng, clock)
     else:
         found = _search(space, criterion, relaxed, seeds[:CHUNKS], clock, executor)
     return _assemble(space, target, relaxed, found, clock)
@@ -136,7 +136,13 @@ def _relax(
 ) -> RelaxedDesign:
     problem = space.problem
     relaxed = RelaxedProblem(
-        space.single, criterion, space.prior, problem.measurements, space.feasibility, _pool(problem)
+        space.single,
+        criterion,
+        space.prior,
+        problem.measurements,
+        space.feasibility,
+        _pool(problem),
+        None if problem.candidates is None or problem.repeat_candidates else problem.configurations,
     )
     tests = problem.test_pose_array
     usable = tests[space.feasibility.mask(tests)] if problem.candidates is None else tests[:0]
@@ -189,19 +195,29 @@ def _search(
     return replace(best, starts=done, evaluations=evaluations)
 
 
-def _choose(space: PlanSpace, criterion: Criterion, rng: np.random.Generator, clock: _Clock) -> SearchResult:
+def _choose(
+    space: PlanSpace,
+    criterion: Criterion,
+    relaxed: RelaxedDesign | None,
+    rng: np.random.Generator,
+    clock: _Clock,
+) -> SearchResult:
     """From the candidates."""
     problem = space.problem
     pool = np.asarray(problem.candidates)
     allowed = np.flatnonzero(space.feasibility.mask(pool))
-    unit = space.model.at(pool[allowed])
-    chosen = choose(
-        PoolProblem(unit, criterion, space.prior, problem.configurations, problem.repeat_candidates, np.empty(0)),
-        rng,
-        clock.stop,
+    request = PoolProblem(
+        rows=space.model.whitened(pool[allowed]),
+        criterion=criterion,
+        prior=space.prior,
+        size=problem.configurations,
+        repeat=problem.repeat_candidates,
+        weights=relaxed.weights if relaxed else np.empty(0),
+        names=space.robot.parameter_names,
     )
+    chosen = choose(request, rng, clock.stop)
     clock.tell(problem.starts, chosen.log_worth)
-    return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, 1, chosen.evaluations)
+    return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
 
 
 # ── the answer ───────────────────────────────────────────────────────────────────────────────────────

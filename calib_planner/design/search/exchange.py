@@ -1,26 +1,34 @@
 """The best plan from a finite pool of candidates: greedy start, then exchange (Fedorov 1972), batched.
 
 With M the information of the chosen rows and G = ∂Ψ/∂M, tr(G I_j) is the gain per unit weight of candidate j:
-one matrix product ranks the whole pool. A pass takes the chosen row of least worth out and tries the best
-candidates in its place exactly; it ends when no single exchange improves Ψ.
+one matrix product ranks the whole pool. A pass takes every chosen row out in turn and tries the best
+candidates in its place; it ends when no single exchange improves Ψ. For determinants the trial of the *whole*
+pool is exact at the price of one product, see ``determinant``; with nuisance parameters eliminated,
+log det S = log det M − log det M_nn is two of them. Other criteria try a shortlist of first-order best.
 
-The determinant of a rank-3T change is exact and cheap: det(M + JᵀWJ) = det(M) det(I + W^½ J M⁻¹ Jᵀ W^½), so
-for D the whole pool is tried exactly at every step.
+Starts: the relaxed optimum rounded, greedy from nothing, and some random choices; the best end wins. All cost is
+linear in the number of candidates.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.design.criteria import Criterion
+from calib_planner.design.criteria import Criterion, Determinant, Eliminating
+from calib_planner.design.identifiability import analyse
+from calib_planner.design.search.determinant import RunningDeterminant, pool_rows
 from calib_planner.errors import InfeasibleError
 
 SHORTLIST = 24
-"""Candidates tried exactly in place of each row."""
+"""Candidates tried exactly in place of each row, where the whole pool cannot be."""
+RANDOM_STARTS = 4
+"""Starts from random rows, besides the rounded and the greedy one."""
+MOST_PASSES = 100
+"""Passes over the chosen rows after which an exchange is called finished; 3 to 8 are usual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,116 +36,244 @@ class PoolProblem:
     """Choose ``size`` rows of a pool.
 
     Attributes:
-        unit: (C, p, p) information of each candidate.
+        rows: (C, k, p) whitened Jacobians W^½ J of each candidate; RᵀR is its information.
         criterion: Its worth is maximised.
         prior: (p, p) M_0.
         size: Number of rows.
         repeat: Whether a row may be chosen more than once.
         weights: (C,) relaxed weights to start from, or empty.
+        names: p names of the parameters, for messages.
     """
 
-    unit: FloatArray
+    rows: FloatArray
     criterion: Criterion
     prior: FloatArray
     size: int
-    repeat: bool
-    weights: FloatArray
+    repeat: bool = False
+    weights: FloatArray = field(default_factory=lambda: np.empty(0))
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class PoolResult:
-    """Chosen rows (size,), the log of their worth, exchanges tried."""
+    """Chosen rows (size,), the log of their worth, exchanges tried, starts done."""
 
     rows: IntArray
     log_worth: float
     evaluations: int
+    starts: int = 1
 
 
 def choose(
     problem: PoolProblem, rng: np.random.Generator, stop: Callable[[], bool] = lambda: False
 ) -> PoolResult:
-    """Choose rows; the best of a rounded relaxed start and a random one, both exchanged to the end.
+    """Choose rows; every start is exchanged to the end, the best wins.
 
     Raises:
-        InfeasibleError: The pool cannot identify the parameters, whichever rows are chosen.
+        InfeasibleError: The pool cannot identify the parameters, whichever rows are chosen; names the
+            combinations of parameters that no candidate shows. Or there are fewer candidates than rows.
     """
-    flat = problem.unit.reshape(len(problem.unit), -1)
-    full = (flat.sum(axis=0)).reshape(problem.prior.shape) + problem.prior
-    scale = np.sqrt(np.maximum(np.diag(full), 1e-300))
-    if np.linalg.eigvalsh(full / np.outer(scale, scale))[0] < 1e-12:
-        raise InfeasibleError("candidates", "even all rows together do not identify the parameters")
-    starts = [_greedy(problem, flat, _rounded(problem))]
-    starts.append(_greedy(problem, flat, np.empty(0, np.int64)))
+    _check(problem)
+    search: _Search = _Exact(problem) if _is_determinant(problem.criterion) else _Shortlisted(problem)
     best: PoolResult | None = None
-    for rows in starts:
-        result = _exchange(problem, flat, rows, stop)
-        if best is None or result.log_worth > best.log_worth:
-            best = result
+    count = evaluations = 0
+    for start in _starts(problem, rng):
+        count += 1
+        rows, tried = search.run(start, stop)
+        log_worth = _log_worth(problem, rows)
+        evaluations += tried
+        if best is None or log_worth > best.log_worth:
+            best = PoolResult(rows, log_worth, 0)
         if stop():
             break
     assert best is not None
-    return best
+    return PoolResult(best.rows, best.log_worth, evaluations, count)
+
+
+def _check(problem: PoolProblem) -> None:
+    candidates, _, p = problem.rows.shape
+    if not candidates or (candidates < problem.size and not problem.repeat):
+        raise InfeasibleError(
+            "candidates", f"{candidates} feasible rows, {problem.size} different ones are needed"
+        )
+    values, vectors = np.linalg.eigh(problem.prior)
+    known = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    stacked = np.concatenate([problem.rows.reshape(-1, p), known])
+    largest = float(np.linalg.norm(stacked, axis=0).max()) or 1.0
+    found = analyse(stacked / largest, problem.names or [f"parameter_{i}" for i in range(p)])
+    if found.held:
+        raise InfeasibleError(
+            "candidates",
+            f"all {candidates} rows together do not identify {len(found.held)} of {p} parameters; no candidate "
+            f"shows {'; '.join(found.combinations)}. Add other candidates, ask for fewer parameters or give "
+            "prior standard deviations",
+        )
+
+
+def _starts(problem: PoolProblem, rng: np.random.Generator) -> list[IntArray]:
+    """Rows to begin from, to be filled up greedily where they are fewer than ``size``."""
+    starts = [_rounded(problem)] if len(problem.weights) else []
+    starts.append(np.empty(0, np.int64))
+    for _ in range(RANDOM_STARTS):
+        starts.append(rng.choice(len(problem.rows), problem.size, replace=problem.repeat))
+    return starts
 
 
 def _rounded(problem: PoolProblem) -> IntArray:
     """Rows whose relaxed weight asks for at least half a measurement, heaviest first."""
-    if not len(problem.weights):
-        return np.empty(0, np.int64)
     shares = problem.weights * problem.size
     counts = np.floor(shares + 0.5).astype(np.int64)
     if not problem.repeat:
         counts = np.minimum(counts, 1)
-    order = np.argsort(-shares)
+    order = np.argsort(-shares, kind="stable")
     return np.repeat(order, counts[order])[: problem.size]
 
 
-def _greedy(problem: PoolProblem, flat: FloatArray, rows: IntArray) -> IntArray:
-    """Fill up with the candidate of largest first-order gain, from a small multiple of the pool's mean."""
-    chosen = list(rows)
-    ground = problem.prior + 1e-3 * problem.size * flat.mean(axis=0).reshape(problem.prior.shape)
-    matrix = ground + flat[chosen].sum(axis=0).reshape(ground.shape)
-    while len(chosen) < problem.size:
-        slope = problem.criterion.worth_and_slope(matrix[None])[1][0]
-        gain = flat @ slope.ravel()
-        if not problem.repeat:
-            gain[chosen] = -np.inf
-        chosen.append(int(np.argmax(gain)))
-        matrix = matrix + problem.unit[chosen[-1]]
-    return np.array(chosen, np.int64)
+def _information(problem: PoolProblem, rows: IntArray) -> FloatArray:
+    own = problem.rows[rows].reshape(-1, problem.rows.shape[2])
+    return problem.prior + own.T @ own
 
 
-def _exchange(problem: PoolProblem, flat: FloatArray, rows: IntArray, stop: Callable[[], bool]) -> PoolResult:
-    rows = rows.copy()
-    shape = problem.prior.shape
-    matrix = problem.prior + flat[rows].sum(axis=0).reshape(shape)
-    worth = _worths(problem, matrix[None])[0]
-    evaluations, improved = 1, True
-    while improved and not stop():
-        improved = False
-        for position in range(problem.size):
-            without = matrix - problem.unit[rows[position]]
-            pool = _shortlist(problem, flat, matrix, rows)
-            trial = _worths(problem, without + problem.unit[pool])
-            evaluations += len(pool)
-            best = int(np.argmax(trial))
-            if trial[best] > worth * (1.0 + 1e-9):
-                rows[position], worth = pool[best], float(trial[best])
-                matrix = without + problem.unit[pool[best]]
-                improved = True
-    return PoolResult(rows, float(np.log(worth)) if worth > 0 else -np.inf, evaluations)
+def _log_worth(problem: PoolProblem, rows: IntArray) -> float:
+    worth = float(_worths(problem.criterion, _information(problem, rows)[None])[0])
+    return float(np.log(worth)) if worth > 0 else -np.inf
 
 
-def _worths(problem: PoolProblem, matrices: FloatArray) -> FloatArray:
-    diagonal = np.einsum("spp->sp", matrices)
-    floor = 1e-13 * diagonal.mean(axis=1)[:, None, None] * np.eye(matrices.shape[-1])
-    worth = problem.criterion.worth_and_slope(matrices + floor)[0]
+def _worths(criterion: Criterion, matrices: FloatArray) -> FloatArray:
+    """Ψ (S,), with so small a ridge that a singular matrix is worth little, not nothing."""
+    diagonal = np.einsum("sii->si", matrices)
+    floor = 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1])
+    worth = criterion.worth_and_slope(matrices + floor)[0]
     return np.where(np.isfinite(worth), worth, 0.0)
 
 
-def _shortlist(problem: PoolProblem, flat: FloatArray, matrix: FloatArray, rows: IntArray) -> IntArray:
-    slope = problem.criterion.worth_and_slope(matrix[None])[1][0]
-    gain = flat @ slope.ravel()
-    if not problem.repeat:
-        gain[rows] = -np.inf
-    count = min(SHORTLIST, int(np.isfinite(gain).sum()))
-    return np.argpartition(-gain, count - 1)[:count] if count else rows[:1]
+class _Search:
+    """One start, exchanged to the end."""
+
+    def run(self, start: IntArray, stop: Callable[[], bool]) -> tuple[IntArray, int]:
+        """Chosen rows, and exchanges tried."""
+        raise NotImplementedError
+
+
+# ── determinants: the whole pool, exactly ────────────────────────────────────────────────────────────
+
+
+def _is_determinant(criterion: Criterion) -> bool:
+    inner = criterion.inner if isinstance(criterion, Eliminating) else criterion
+    return isinstance(inner, Determinant)
+
+
+class _Exact(_Search):
+    def __init__(self, problem: PoolProblem) -> None:
+        self.problem = problem
+        self.parts = [(1, pool_rows(problem.rows, problem.prior, problem.size))]
+        if isinstance(problem.criterion, Eliminating):
+            n = np.array(problem.criterion.nuisance)
+            rows, prior = np.ascontiguousarray(problem.rows[:, :, n]), problem.prior[np.ix_(n, n)]
+            self.parts.append((-1, pool_rows(rows, prior, problem.size)))
+
+    def run(self, start: IntArray, stop: Callable[[], bool]) -> tuple[IntArray, int]:
+        problem, chosen = self.problem, [int(i) for i in start]
+        state = [(sign, RunningDeterminant(pool, start)) for sign, pool in self.parts]
+        tried = 0
+        while len(chosen) < problem.size:
+            chosen.append(self._best(state, chosen))
+            self._change(state, chosen[-1], 1)
+        for _ in range(MOST_PASSES):
+            changed = 0
+            self._refresh(state, chosen, strained=False)
+            for position, old in enumerate(chosen):
+                if stop():
+                    return np.array(chosen), tried
+                self._change(state, old, -1)
+                gains = self._gains(state, chosen[:position] + chosen[position + 1 :])
+                new, tried = int(np.argmax(gains)), tried + len(gains)
+                if gains[new] <= gains[old] + 1e-9:
+                    new = old
+                changed += new != old
+                chosen[position] = new
+                self._change(state, new, 1)
+                self._refresh(state, chosen, strained=True)
+            if not changed:
+                break
+        return np.array(chosen), tried
+
+    def _gains(self, state: list[tuple[int, RunningDeterminant]], taken: list[int]) -> FloatArray:
+        gains: FloatArray = np.sum([sign * part.gains() for sign, part in state], axis=0)
+        if not self.problem.repeat:
+            gains[taken] = -np.inf
+        return gains
+
+    def _best(self, state: list[tuple[int, RunningDeterminant]], taken: list[int]) -> int:
+        return int(np.argmax(self._gains(state, taken)))
+
+    def _change(self, state: list[tuple[int, RunningDeterminant]], row: int, sign: int) -> None:
+        for _, part in state:
+            part.change(row, sign)
+
+    def _refresh(self, state: list[tuple[int, RunningDeterminant]], chosen: list[int], *, strained: bool) -> None:
+        for _, part in state:
+            if part.strained or not strained:
+                part.reset(np.array(chosen))
+
+
+# ── any other criterion: first-order shortlist ───────────────────────────────────────────────────────
+
+
+class _Shortlisted(_Search):
+    def __init__(self, problem: PoolProblem) -> None:
+        self.problem = problem
+        self.flat = problem.rows.reshape(-1, problem.rows.shape[2])
+        self.average = self.flat.T @ self.flat / len(problem.rows)
+
+    def run(self, start: IntArray, stop: Callable[[], bool]) -> tuple[IntArray, int]:
+        problem, rows = self.problem, self._greedy(start)
+        matrix = _information(problem, rows)
+        worth = float(_worths(problem.criterion, matrix[None])[0])
+        tried = 1
+        for _ in range(MOST_PASSES):
+            improved = False
+            for position in range(problem.size):
+                if stop():
+                    return rows, tried
+                without = matrix - self._unit(rows[position : position + 1])[0]
+                pool = self._shortlist(matrix, rows)
+                if not pool.size:
+                    continue
+                trial = _worths(problem.criterion, without + self._unit(pool))
+                tried += len(pool)
+                best = int(np.argmax(trial))
+                if trial[best] > worth * (1.0 + 1e-9):
+                    rows[position], worth, improved = pool[best], float(trial[best]), True
+                    matrix = _information(problem, rows)
+            if not improved:
+                break
+        return rows, tried
+
+    def _unit(self, rows: IntArray) -> FloatArray:
+        own = self.problem.rows[rows]
+        return np.swapaxes(own, 1, 2) @ own
+
+    def _gains(self, matrix: FloatArray) -> FloatArray:
+        """(C,) tr(G I_j)."""
+        slope = self.problem.criterion.worth_and_slope(matrix[None])[1][0]
+        gains = ((self.flat @ slope) * self.flat).sum(axis=1).reshape(len(self.problem.rows), -1).sum(axis=1)
+        return np.where(np.isfinite(gains), gains, 0.0)
+
+    def _greedy(self, start: IntArray) -> IntArray:
+        """Fill up with the candidate of largest first-order gain, from a small multiple of the pool's mean."""
+        chosen, ground = list(start), 1e-3 * self.problem.size * self.average
+        while len(chosen) < self.problem.size:
+            gains = self._gains(ground + _information(self.problem, np.array(chosen, np.int64)))
+            if not self.problem.repeat:
+                gains[chosen] = -np.inf
+            chosen.append(int(np.argmax(gains)))
+        return np.array(chosen, np.int64)
+
+    def _shortlist(self, matrix: FloatArray, rows: IntArray) -> IntArray:
+        """Best first-order candidates; the matrix gets a small multiple of the pool's mean to rank by."""
+        gains = self._gains(matrix + 1e-6 * self.problem.size * self.average)
+        if not self.problem.repeat:
+            gains[rows] = -np.inf
+        count = min(SHORTLIST, int(np.isfinite(gains).sum()))
+        return np.argpartition(-gains, count - 1)[:count] if count else np.empty(0, np.int64)
