@@ -260,7 +260,8 @@ def _draw_accuracy(axes: Any, result: DemoResult) -> None:
     colours = ["0.6", "C0", "C1"]
     for i, (_, achieved, predicted) in enumerate(rows):
         axes.barh(i, 1e3 * achieved, color=colours[i], height=0.6)
-        axes.text(1e3 * achieved, i, f" {1e3 * achieved:.4f}", va="center")
+        right = 1e3 * max(achieved, predicted or 0.0)
+        axes.text(right, i, f"  {1e3 * achieved:.4f}", va="center")
         if predicted is not None:
             label = "predicted ρ0" if i == 1 else None
             axes.plot([1e3 * predicted] * 2, [i - 0.38, i + 0.38], "k--", label=label)
