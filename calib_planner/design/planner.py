@@ -26,11 +26,12 @@ from calib_planner.design.information import covariance, error_variance
 from calib_planner.design.order import visiting_order
 from calib_planner.design.plan import STATUS, Plan
 from calib_planner.design.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.design.prove import Proof, prove_bound
 from calib_planner.design.search.exchange import PoolProblem, choose
 from calib_planner.design.search.multistart import CHUNKS, SearchProblem, SearchResult, search_chunk
 from calib_planner.design.space import PlanSpace, plan_space
 
-__all__ = ["Progress", "plan"]
+__all__ = ["Progress", "plan", "worth_of"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,13 @@ class Progress:
 Callback = Callable[[Progress], bool | None]
 
 
-def plan(problem: PlanProblem, callback: Callback | None = None, executor: Executor | None = None) -> Plan:
+def plan(
+    problem: PlanProblem,
+    callback: Callback | None = None,
+    executor: Executor | None = None,
+    *,
+    prove: bool = False,
+) -> Plan:
     """Find the best configurations, and a bound on how good any could be.
 
     Args:
@@ -62,6 +69,7 @@ def plan(problem: PlanProblem, callback: Callback | None = None, executor: Execu
         callback: Told of progress; returning ``True`` cancels, the best plan so far being returned.
         executor: Any ``concurrent.futures`` executor; the plan is the same whichever, or without one. With
             one, time limit and cancellation act between the parts of the work.
+        prove: Make the bound rigorous (see ``prove``); the message says how close and, if not, why.
 
     Raises:
         InfeasibleError: Nothing satisfies the problem; names what stands in the way.
@@ -72,12 +80,25 @@ def plan(problem: PlanProblem, callback: Callback | None = None, executor: Execu
     criterion, target = _criteria(space, np.random.default_rng(seeds[CHUNKS]))
     rng = np.random.default_rng(seeds[CHUNKS])
     relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
+    proof = None
+    if prove and relaxed is not None:
+        proof_rng = np.random.default_rng(seeds[CHUNKS].spawn(1)[0])
+        relaxed, proof = prove_bound(_relaxed_problem(space, target), relaxed, proof_rng, stop=clock.stop)
     clock.tell(bound=relaxed.bound if relaxed else None)
     if problem.candidates is not None:
         found = _choose(space, criterion, relaxed, rng, clock)
     else:
         found = _search(space, criterion, relaxed, seeds[:CHUNKS], clock, executor)
-    return _assemble(space, target, relaxed, found, clock)
+    return _assemble(space, target, relaxed, proof, found, clock)
+
+
+def worth_of(problem: PlanProblem, configurations: FloatArray) -> float:
+    """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
+    space = plan_space(problem)
+    matrix = space.model.at(configurations).sum(axis=0) + space.prior
+    hidden = covariance(matrix)[1]
+    worth = 0.0 if _blind(space, hidden) else space.criterion(problem.criterion).exact(_regular(matrix, hidden))
+    return reported_value(problem.criterion, worth, len(space.interest), problem.measurements)
 
 
 # ── the parts ────────────────────────────────────────────────────────────────────────────────────────
@@ -134,8 +155,14 @@ def _criteria(space: PlanSpace, rng: np.random.Generator) -> tuple[Criterion, Cr
 def _relax(
     space: PlanSpace, criterion: Criterion, rng: np.random.Generator, stop: Callable[[], bool]
 ) -> RelaxedDesign:
+    tests = space.problem.test_pose_array
+    usable = tests[space.feasibility.mask(tests)] if space.problem.candidates is None else tests[:0]
+    return relaxed_design(_relaxed_problem(space, criterion), usable, rng, stop)
+
+
+def _relaxed_problem(space: PlanSpace, criterion: Criterion) -> RelaxedProblem:
     problem = space.problem
-    relaxed = RelaxedProblem(
+    return RelaxedProblem(
         space.single,
         criterion,
         space.prior,
@@ -144,9 +171,6 @@ def _relax(
         _pool(problem),
         None if problem.candidates is None or problem.repeat_candidates else problem.configurations,
     )
-    tests = problem.test_pose_array
-    usable = tests[space.feasibility.mask(tests)] if problem.candidates is None else tests[:0]
-    return relaxed_design(relaxed, usable, rng, stop)
 
 
 def _pool(problem: PlanProblem) -> FloatArray | None:
@@ -224,7 +248,12 @@ def _choose(
 
 
 def _assemble(
-    space: PlanSpace, target: Criterion, relaxed: RelaxedDesign | None, found: SearchResult, clock: _Clock
+    space: PlanSpace,
+    target: Criterion,
+    relaxed: RelaxedDesign | None,
+    proof: Proof | None,
+    found: SearchResult,
+    clock: _Clock,
 ) -> Plan:
     problem, robot = space.problem, space.robot
     configurations = found.configurations[visiting_order(found.configurations, robot)]
@@ -239,7 +268,10 @@ def _assemble(
         worth = accuracy**-2  # the figure reported, to the last digit
     else:
         worth = target.exact(_regular(matrix, hidden))
-    bound = max(relaxed.bound, worth) if relaxed else float("nan")
+    proven = proof is not None and proof.holds
+    bound = float("nan")
+    if relaxed is not None:
+        bound = relaxed.bound if proven else max(relaxed.bound, worth)
     name = "compound" if problem.compound else problem.criterion
     size, n = len(space.interest), problem.measurements
     value = worth if problem.compound else reported_value(name, worth, size, n)
@@ -248,7 +280,8 @@ def _assemble(
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
     status = "singular" if hidden.size and status == "ok" else status
     combinations = space.identifiability.combinations
-    note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}."
+    note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}." if combinations else ""
+    note += f" {proof.text}" if proof else ""
     return Plan(
         robot=robot.name,
         criterion=name,
@@ -268,9 +301,9 @@ def _assemble(
         value_bound=value_bound,
         lower_bound=value_bound if name in POSE_CRITERIA else float("nan"),
         efficiency=_efficiency(name, worth, bound, value, value_bound) if relaxed else float("nan"),
-        bound="numerical" if relaxed else "none",
+        bound="proven" if proven else "numerical" if relaxed else "none",
         status=status,
-        message=STATUS[status] + (note if combinations else ""),
+        message=STATUS[status] + note,
         seconds=clock.seconds,
         seed=problem.seed,
         starts=found.starts,
