@@ -159,7 +159,7 @@ def test_module_version_and_closed_pipe() -> None:
 
 
 def test_interrupt(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(importlib.import_module("calib_planner.cli.plan"), "find_plan", interrupted)
