@@ -52,6 +52,11 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
     except (CalibPlannerError, ParameterException) as error:
         print(f"{sys.argv[0]}: {error}", file=sys.stderr)
         return 1
+    except Exception:
+        # The context may be shut down while a callback is using it: that is the end asked for, not a fault.
+        if asked or not rclpy.ok():
+            return 0
+        raise
     finally:
         close = getattr(node, "close", None)
         ended = close() if close is not None else True
