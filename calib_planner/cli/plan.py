@@ -57,6 +57,7 @@ def add(commands: Commands) -> None:
         metavar="W",
         help="share of the criterion for accuracy everywhere, 0 … 1 (1e-4)",
     )
+    search.add_argument("--prove", action="store_true", help="make the bound rigorous, by branch and bound")
     search.add_argument("--starts", type=int, default=64, metavar="N", help="random starts (64)")
     search.add_argument("--time-limit", type=float, default=float("inf"), metavar="S", help="seconds (none)")
     add_seed(search)
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             text = f"best ρ0 {1e3 * progress.best_accuracy:.4f} mm" if progress.starts_done else ""
             update(progress.starts_done / progress.starts_total, text)
 
-        found = find_plan(problem, report)
+        found = find_plan(problem, report, prove=args.prove)
     if args.output:
         _write(args.output, found)
     result = found.to_dict() | ({"output": args.output} if args.output else {})

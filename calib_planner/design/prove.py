@@ -44,6 +44,7 @@ PROOF_STATUS = {
     "time_limit": "The bound is proven, less closely than asked because time was up",
     "noise": "The bound stays numerical: only isotropic noise makes the sensitivity a polynomial",
     "joints": "The bound stays numerical: too many joints for a proof",
+    "pool": "The bound is proven: every candidate was looked at",
 }
 """Every status a proof can have."""
 
@@ -92,7 +93,7 @@ class Proof:
     @property
     def text(self) -> str:
         """One sentence for people."""
-        close = f" to {self.tolerance:.1g} of the sensitivity" if self.holds else ""
+        close = f" to {self.tolerance:.1g} of the sensitivity" if self.active else ""
         return f"{PROOF_STATUS[self.status]}{close}."
 
 
@@ -113,16 +114,24 @@ def prove_bound(
     Returns:
         The design with the smallest proven bound, and its proof; the design unchanged if nothing is proven.
     """
+    if problem.pool is not None:
+        return relaxed, _prove_pool(problem, problem.pool, relaxed.slope)
     deadline = time.perf_counter() + time_limit
     free = replace(problem, feasibility=replace(problem.feasibility, constraints=()))
-    tried = relaxed
-    if problem.feasibility.constraints and problem.pool is None and not _obstacle(problem.model):
+    bounded, tried = bool(problem.feasibility.constraints), relaxed
+    if bounded and not _obstacle(problem.model):
         tried = relaxed_design(free, relaxed.support, rng, stop)
-    bounded = bool(problem.feasibility.constraints)
     best: tuple[float, Proof] | None = None
     for _ in range(ROUNDS):
-        left = max(deadline - time.perf_counter(), 1e-3)
-        proof = _prove(free, problem, tried, tolerance, left, stop)
+        proof = prove_maximum(
+            problem.model,
+            problem.criterion,
+            tried.slope,
+            tried.support,
+            tolerance=tolerance,
+            time_limit=max(deadline - time.perf_counter(), 1e-3),
+            stop=stop,
+        )
         if not proof.holds:
             return relaxed, proof
         ceiling = proof.ceiling(problem.prior, problem.measurements)
@@ -131,34 +140,12 @@ def prove_bound(
         if tried.worth > relaxed.worth and not bounded:
             relaxed = tried
         missed = ceiling > (1.0 + MISSED + proof.tolerance) * tried.bound
-        if not missed or problem.pool is not None or stop() or time.perf_counter() > deadline:
+        if not missed or stop() or time.perf_counter() > deadline:
             break
         strong = tried.support[tried.weights > 1e-3]
         tried = relaxed_design(free, np.concatenate([strong, proof.where[None]]), rng, stop)
     assert best is not None
     return replace(relaxed, bound=best[0], slope=best[1].slope), best[1]
-
-
-def _prove(
-    free: RelaxedProblem,
-    problem: RelaxedProblem,
-    tried: RelaxedDesign,
-    tolerance: float,
-    time_limit: float,
-    stop: Callable[[], bool],
-) -> Proof:
-    if problem.pool is not None:
-        pool = problem.pool[problem.feasibility.mask(problem.pool)]
-        return prove_pool(problem.model, problem.criterion, tried.slope, pool)
-    return prove_maximum(
-        free.model,
-        free.criterion,
-        tried.slope,
-        tried.support,
-        tolerance=tolerance,
-        time_limit=time_limit,
-        stop=stop,
-    )
 
 
 def prove_maximum(
@@ -206,15 +193,12 @@ def prove_maximum(
     )
 
 
-def prove_pool(model: InformationModel, criterion: Criterion, slope: FloatArray, pool: FloatArray) -> Proof:
-    """The same over a finite pool (C, joints) with any noise: every d is computed."""
-    began = time.perf_counter()
-    root = square_root(slope)
-    d = np.einsum("nab,ab->n", model.at(pool), root @ root.T)
-    best, top = int(np.argmax(d)), float(d.max())
-    upper = top * (1.0 + 1e-10)
-    seconds = time.perf_counter() - began
-    return Proof(upper, top, pool[best], root @ root.T, _scale(criterion, root), len(d), (), seconds, "proven")
+def _prove_pool(problem: RelaxedProblem, pool: FloatArray, slope: FloatArray) -> Proof:
+    """Over a finite pool (C, joints) with any noise: every d is computed, the bound is exact already."""
+    q = pool[problem.feasibility.mask(pool)]
+    d = np.einsum("nab,ab->n", problem.model.at(q), slope)
+    best = int(np.argmax(d))
+    return Proof(float(d[best]), float(d[best]), q[best], slope, 1.0, len(q), (), 0.0, "pool")
 
 
 def _obstacle(model: InformationModel) -> str:
