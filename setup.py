@@ -38,6 +38,7 @@ setup(
     extras_require={
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
         "bags": ["rosbags"],
+        "collision": ["pin"],
         "distributed": ["dask[distributed]"],
     },
     entry_points={

@@ -17,6 +17,7 @@ from calib_planner.cli.arguments import (
     numbers,
     test_poses,
 )
+from calib_planner.cli.conditions import add_conditions, conditions
 from calib_planner.cli.plan_table import show_plan
 from calib_planner.cli.terminal import Terminal
 from calib_planner.design.plan import Plan
@@ -45,9 +46,7 @@ def add(commands: Commands) -> None:
     work = parser.add_argument_group("what may be measured")
     work.add_argument("--configurations", type=int, required=True, metavar="M", help="how many different")
     work.add_argument("--repetitions", type=int, default=1, metavar="K", help="measurements at each (1)")
-    work.add_argument(
-        "--sigma", type=float, default=3e-5, metavar="S", help="tracker's std of one coordinate [m] (3e-5)"
-    )
+    add_conditions(work)
     search = parser.add_argument_group("search")
     search.add_argument("--criterion", choices=CRITERIA, default="test_pose", help="what is minimised")
     search.add_argument(
@@ -95,7 +94,7 @@ def _problem(args: argparse.Namespace) -> PlanProblem:
         configurations=args.configurations,
         repetitions=args.repetitions,
         weights=args.weights,
-        sigma=args.sigma,
+        **conditions(args, robot),
         criterion=args.criterion,
         general_weight=args.general_weight,
         starts=args.starts,

@@ -30,13 +30,12 @@ def write_document(path: str | Path, kind: str, content: Mapping[str, Any], fiel
     write_text(path, text, field)
 
 
-def read_document(path: str | Path, kind: str) -> dict[str, Any]:
-    """The mapping of a document of this kind, without its format line.
+def read_mapping(path: str | Path, what: str) -> dict[str, Any]:
+    """The mapping that a YAML file holds, whatever its keys; ``what`` says in errors what it should be.
 
     Raises:
-        FileFormatError: Not YAML, or not such a document.
+        FileFormatError: Not YAML, or something else than a mapping.
     """
-    what = f"a YAML file of calib_planner/{kind}"
     text = read_text(path, what)
     try:
         document = yaml.load(text, Loader=_Loader)  # a SafeLoader
@@ -45,6 +44,17 @@ def read_document(path: str | Path, kind: str) -> dict[str, Any]:
         raise FileFormatError(path, "YAML", reason, what) from None
     if not isinstance(document, dict):
         raise FileFormatError(path, "document", type(document).__name__, what)
+    return document
+
+
+def read_document(path: str | Path, kind: str) -> dict[str, Any]:
+    """The mapping of a document of this kind, without its format line.
+
+    Raises:
+        FileFormatError: Not YAML, or not such a document.
+    """
+    what = f"a YAML file of calib_planner/{kind}"
+    document = read_mapping(path, what)
     if document.get("format") != f"calib_planner/{kind}":
         got = repr(document.get("format"))[:60]
         advice = f"give a file that calib-planner {kind.replace('estimate', 'identify')} --output wrote"

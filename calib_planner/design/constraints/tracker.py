@@ -40,6 +40,7 @@ class TrackerRange:
     def __post_init__(self) -> None:
         object.__setattr__(self, STATION, check_array(STATION, self.station, (3,)))
         object.__setattr__(self, "minimum", check_number("minimum", self.minimum, low=0, unit="m"))
+        object.__setattr__(self, "maximum", float(self.maximum))
         if not self.minimum < self.maximum:
             raise InputError("tracker range", f"{self.minimum} to {self.maximum}", "minimum < maximum, in m")
 
