@@ -1,7 +1,7 @@
 """The verb: ``plan(problem)`` → ``Plan``. Prepare, relax, search, prove what was reached.
 
 The relaxed problem comes first: its optimum is the bound, and its support is where good plans are. Then the
-search, in ``CHUNKS`` independent parts that any ``concurrent.futures`` executor may do. Compound criteria are
+search, in independent parts that any ``concurrent.futures`` executor may do. Compound criteria are
 geometric means of efficiencies, so their parts' relaxed optima are found before them.
 """
 
@@ -28,7 +28,7 @@ from calib_planner.design.plan import STATUS, Plan
 from calib_planner.design.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.design.prove import Proof, prove_bound
 from calib_planner.design.search.exchange import PoolProblem, choose
-from calib_planner.design.search.multistart import CHUNKS, SearchProblem, SearchResult, search_chunk
+from calib_planner.design.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.design.space import PlanSpace, plan_space
 
 __all__ = ["Progress", "plan", "worth_of"]
@@ -76,19 +76,19 @@ def plan(
     """
     space = plan_space(problem)
     clock = _Clock(problem, len(space.interest), callback)
-    seeds = np.random.SeedSequence(problem.seed).spawn(CHUNKS + 1)
-    criterion, target = _criteria(space, np.random.default_rng(seeds[CHUNKS]))
-    rng = np.random.default_rng(seeds[CHUNKS])
+    *seeds, own = np.random.SeedSequence(problem.seed).spawn(len(parts(problem.starts)) + 1)
+    criterion, target = _criteria(space, np.random.default_rng(own))
+    rng = np.random.default_rng(own)
     relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
     proof = None
     if prove and relaxed is not None:
-        proof_rng = np.random.default_rng(seeds[CHUNKS].spawn(1)[0])
+        proof_rng = np.random.default_rng(own.spawn(1)[0])
         relaxed, proof = prove_bound(_relaxed_problem(space, target), relaxed, proof_rng, stop=clock.stop)
     clock.tell(bound=relaxed.bound if relaxed else None)
     if problem.candidates is not None:
         found = _choose(space, criterion, relaxed, rng, clock)
     else:
-        found = _search(space, criterion, relaxed, seeds[:CHUNKS], clock, executor)
+        found = _search(space, criterion, relaxed, seeds, clock, executor)
     return _assemble(space, target, relaxed, proof, found, clock)
 
 
@@ -196,8 +196,8 @@ def _search(
         support=relaxed.support if relaxed else nobody,
         weights=relaxed.weights if relaxed else np.empty(0),
     )
-    starts = [len(part) for part in np.array_split(np.arange(space.problem.starts), CHUNKS)]
-    work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(starts, seeds, strict=True) if n]
+    sizes = parts(space.problem.starts)
+    work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
     best: SearchResult | None = None
     done = evaluations = 0
     futures = [executor.submit(search_chunk, *job) for job in work] if executor else None

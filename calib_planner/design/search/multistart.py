@@ -10,7 +10,7 @@ Table 2 show that good plans are a few good configurations repeated; the rest is
 Feasibility. Plans that break a constraint are worth nothing (−log Ψ = ∞): a descent that starts inside never
 accepts a step outside, so what comes out is feasible by construction.
 
-Work is cut into ``CHUNKS`` independent parts with their own seeds, whatever executes them: same seed, same plan.
+Work is cut into independent ``parts`` with their own seeds, whatever executes them: same seed, same plan.
 """
 
 from __future__ import annotations
@@ -28,9 +28,16 @@ from calib_planner.design.search.descent import Descent, Objective, descend
 
 RIDGE = 1e-12
 """Added to the information of a plan, relative to its diagonal, so that singular plans stay finite."""
-CHUNKS = 4
+CHUNKS, LARGEST = 4, 32
+"""Fewest parts of the work, and most starts in one."""
 FINALISTS = 3
 """Plans of each chunk that are polished to the end."""
+
+
+def parts(starts: int) -> tuple[int, ...]:
+    """Starts in each independent part of the work."""
+    count = max(CHUNKS, -(-starts // LARGEST))
+    return tuple(starts // count + (k < starts % count) for k in range(count))
 
 
 @dataclass(frozen=True, eq=False)
