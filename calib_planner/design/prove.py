@@ -93,7 +93,7 @@ class Proof:
     @property
     def text(self) -> str:
         """One sentence for people."""
-        close = f" to {self.tolerance:.1g} of the sensitivity" if self.active else ""
+        close = f" to {self.tolerance:.1g} of the sensitivity" if self.holds and self.status != "pool" else ""
         return f"{PROOF_STATUS[self.status]}{close}."
 
 
