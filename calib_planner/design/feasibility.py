@@ -14,10 +14,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.design.constraints.posture import PostureConstraint
 from calib_planner.design.constraints.room import JointRange
 from calib_planner.errors import InfeasibleError
 from calib_planner.robot.chain import Robot
+from calib_planner.robot.posture import Posture
 
 PATIENCE = 200_000
 """Random configurations tried before a set of constraints is called empty, or nearly so."""
@@ -70,13 +72,23 @@ class Feasibility:
 
     def mask(self, q: FloatArray) -> NDArray[np.bool_]:
         """(N, joints) → (N,): allowed by every constraint."""
-        ok = np.ones(len(q), bool)
+        left: IntArray = np.arange(len(q))
+        posture: Posture | None = None
         for constraint in self.constraints:
-            left = np.flatnonzero(ok)
+            if not isinstance(constraint, PostureConstraint):
+                ok = constraint.allowed(self.robot, q[left])
+            else:
+                posture = self.robot.posture(q[left]) if posture is None else posture
+                ok = constraint.holds(self.robot, posture)
+            if ok.all():
+                continue
+            left = left[ok]
             if not left.size:
                 break
-            ok[left] = constraint.allowed(self.robot, q[left])
-        return ok
+            posture = None if posture is None else posture.rows(np.flatnonzero(ok))
+        mask = np.zeros(len(q), bool)
+        mask[left] = True
+        return mask
 
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
         """(count, joints) random feasible configurations.

@@ -9,6 +9,7 @@ the flange. A segment without length is a ball.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,9 +50,7 @@ class Capsules:
         """
         count = len(robot.joint_names) + 1
         if self.radii is None:
-            start, end = segments(robot, robot.posture(robot.joint_limits.mean(axis=1)))
-            length = float(np.linalg.norm(end - start, axis=2).sum())
-            return np.full(count, SLENDERNESS * length)
+            return np.full(count, SLENDERNESS * chain_length(robot))
         radii = np.asarray(self.radii)
         if len(radii) not in (1, count):
             wanted = f"one radius, or {count}: base column, then behind {', '.join(robot.joint_names)}"
@@ -64,3 +63,10 @@ def segments(robot: Robot, posture: Posture) -> tuple[FloatArray, FloatArray]:
     base = np.broadcast_to(robot.base_pose[1], (len(posture.tip_origin), 1, 3))
     points = np.concatenate([base, posture.joint_origins, posture.tip_origin[:, None]], axis=1)
     return points[:, :-1], points[:, 1:]
+
+
+@lru_cache(maxsize=64)
+def chain_length(robot: Robot) -> float:
+    """Length of all segments in the middle of the joint ranges [m]."""
+    start, end = segments(robot, robot.posture(robot.joint_limits.mean(axis=1)))
+    return float(np.linalg.norm(end - start, axis=2).sum())

@@ -223,12 +223,8 @@ class Robot:
     def posture(self, q: ArrayLike) -> Posture:
         """Where joints, tip and targets are: every frame of the chain in one pass; see ``Posture``."""
         clean = np.ascontiguousarray(self._check_q(q).T)
-        joints, trunk, t = self._layout.joint_elements, len(self.elements), len(self.targets)
-        # A target's branch begins with Tx, Ty, Tz from the tip: their axes are the tip's.
-        axes, origins = (*joints, trunk, trunk + 1, trunk + 2), (*joints, trunk - 1)
-        structure = structure_of(self.elements, self.targets, self._nominal_amounts, (), axes, origins)
-        rows = compile_program(structure).run(clean, self._nominal_amounts)
-        n = len(joints)
+        rows = self._posture_program.run(clean, self._nominal_amounts)
+        n, t = len(self.joint_names), len(self.targets)
         points = rows.reshape(t + 2 * n + 4, 3, -1).transpose(2, 0, 1)
         return Posture(
             targets=points[:, :t],
@@ -264,6 +260,14 @@ class Robot:
     @cached_property
     def _nominal_amounts(self) -> FloatArray:
         return frozen(np.array([e.value for e in self._flat]))
+
+    @cached_property
+    def _posture_program(self) -> Program:
+        joints, trunk = self._layout.joint_elements, len(self.elements)
+        # A target's branch begins with Tx, Ty, Tz from the tip: their axes are the tip's.
+        axes, origins = (*joints, trunk, trunk + 1, trunk + 2), (*joints, trunk - 1)
+        amounts = self._nominal_amounts
+        return compile_program(structure_of(self.elements, self.targets, amounts, (), axes, origins))
 
     @cached_property
     def _nominal_programs(self) -> dict[tuple[int, ...], Program]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,3 +27,16 @@ class Posture:
     tip_origin: FloatArray
     tip_rotation: FloatArray
     targets: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.tip_origin)
+
+    def rows(self, which: IntArray) -> Posture:
+        """The postures with these numbers."""
+        return Posture(
+            self.joint_origins[which],
+            self.joint_axes[which],
+            self.tip_origin[which],
+            self.tip_rotation[which],
+            self.targets[which],
+        )

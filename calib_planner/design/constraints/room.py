@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_planner._arrays import FloatArray, check_array, check_number, frozen
+from calib_planner.design.constraints.posture import PostureConstraint
 from calib_planner.errors import InfeasibleError, InputError, UnknownNameError
 from calib_planner.instrument.sight import check_direction
 from calib_planner.robot.capsules import Capsules
 from calib_planner.robot.chain import Robot
+from calib_planner.robot.posture import Posture
 
 
 @dataclass(frozen=True, eq=False)
-class WorkspaceBox:
+class WorkspaceBox(PostureConstraint):
     """Every target p is in a box with axes along the frame's: low ≤ p ≤ high, coordinate by coordinate.
 
     Attributes:
@@ -36,17 +38,17 @@ class WorkspaceBox:
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
 
-    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) → (N,)."""
-        points = robot.positions(q)
+    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+        """N postures → (N,)."""
+        points = posture.targets
         if self.tip:
-            points = np.concatenate([points, robot.posture(q).tip_origin[:, None]], axis=1)
+            points = np.concatenate([points, posture.tip_origin[:, None]], axis=1)
         low, high = np.asarray(self.low), np.asarray(self.high)
         return np.asarray(((low <= points) & (points <= high)).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
-class MinimumHeight:
+class MinimumHeight(PostureConstraint):
     """Everything that moves stays above a floor.
 
     With u the unit vector up, h(x) = x·u is linear, so that over a segment it is least at an end: a capsule of
@@ -70,9 +72,9 @@ class MinimumHeight:
         object.__setattr__(self, "height", check_number("height", self.height, unit="m"))
         object.__setattr__(self, "up", check_direction("up", self.up))
 
-    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) → (N,)."""
-        posture, up = robot.posture(q), np.asarray(self.up)
+    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+        """N postures → (N,)."""
+        up = np.asarray(self.up)
         origins = np.concatenate([posture.joint_origins, posture.tip_origin[:, None]], axis=1)
         heights = origins @ up
         if self.capsules is not None:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib_planner._arrays import FloatArray, check_array, check_number
+from calib_planner._arrays import check_array, check_number
+from calib_planner.design.constraints.posture import PostureConstraint
 from calib_planner.errors import InputError
 from calib_planner.instrument.sight import (
     check_direction,
@@ -19,12 +20,13 @@ from calib_planner.instrument.sight import (
 )
 from calib_planner.robot.capsules import Capsules, segments
 from calib_planner.robot.chain import Robot
+from calib_planner.robot.posture import Posture
 
 STATION = "station"
 
 
 @dataclass(frozen=True, eq=False)
-class TrackerRange:
+class TrackerRange(PostureConstraint):
     """Every target p is neither too near nor too far: minimum ≤ |p − s| ≤ maximum.
 
     Attributes:
@@ -44,14 +46,14 @@ class TrackerRange:
         if not self.minimum < self.maximum:
             raise InputError("tracker range", f"{self.minimum} to {self.maximum}", "minimum < maximum, in m")
 
-    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) → (N,)."""
-        d = distances(np.asarray(self.station), robot.positions(q))
+    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+        """N postures → (N,)."""
+        d = distances(np.asarray(self.station), posture.targets)
         return np.asarray(((self.minimum <= d) & (d <= self.maximum)).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
-class TrackerElevation:
+class TrackerElevation(PostureConstraint):
     """The beam to every target leaves the station at an elevation ε the head can turn to: low ≤ ε ≤ high.
 
     Attributes:
@@ -75,14 +77,14 @@ class TrackerElevation:
         if not self.low < self.high:
             raise InputError("tracker elevation", f"{self.low} to {self.high}", "low < high, in rad")
 
-    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) → (N,)."""
-        angle = elevations(np.asarray(self.station), np.asarray(self.up), robot.positions(q))
+    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+        """N postures → (N,)."""
+        angle = elevations(np.asarray(self.station), np.asarray(self.up), posture.targets)
         return np.asarray(((self.low <= angle) & (angle <= self.high)).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
-class ReflectorAcceptance:
+class ReflectorAcceptance(PostureConstraint):
     """The beam falls into every reflector's cone.
 
     A reflector with normal n (tip frame) looks along R n, R the tip's rotation. It returns a beam that comes
@@ -107,8 +109,8 @@ class ReflectorAcceptance:
         angle = check_number("half_angle", self.half_angle, low=0, low_open=True, high=np.pi, unit="rad")
         object.__setattr__(self, "half_angle", angle)
 
-    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) → (N,).
+    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+        """N postures → (N,).
 
         Raises:
             InputError: Neither one normal nor one per target.
@@ -116,14 +118,13 @@ class ReflectorAcceptance:
         normals, targets = np.asarray(self.normal), len(robot.targets)
         if len(normals) not in (1, targets):
             raise InputError("normal", f"{len(normals)} normals", f"one, or {targets}: one per target")
-        posture = robot.posture(q)
         turned = normals @ posture.tip_rotation.transpose(0, 2, 1)
         cosines = incidence_cosines(np.asarray(self.station), posture.targets, turned)
         return np.asarray((cosines >= np.cos(self.half_angle)).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
-class LineOfSight:
+class LineOfSight(PostureConstraint):
     """The beam from the station to every target passes the robot's own links.
 
     The beam s–p has to keep the distance r_k from the axis of every capsule k of the body, where the body is the
@@ -148,9 +149,9 @@ class LineOfSight:
         if self.near is not None:
             object.__setattr__(self, "near", check_number("near", self.near, low=0, unit="m"))
 
-    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) → (N,)."""
-        posture, station = robot.posture(q), np.asarray(self.station)
+    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+        """N postures → (N,)."""
+        station = np.asarray(self.station)
         radii = self.capsules.of(robot)[:-1]
         start, end = (points[:, None, :-1] for points in segments(robot, posture))
         near = float(radii.max()) if self.near is None else self.near

@@ -19,6 +19,9 @@ from calib_planner._arrays import FloatArray, IntArray
 Objective = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Maps X (rows, D) to values (rows,) and gradients (rows, D)."""
 
+Mend = Callable[[FloatArray, FloatArray], FloatArray]
+"""Maps points before and after a step, (rows, D) each, to points after what is allowed of it."""
+
 ARMIJO = 1e-4
 HALVINGS = 12
 
@@ -50,6 +53,7 @@ def descend(
     tolerance: float = 1e-7,
     first_step: float = 0.2,
     stop: Callable[[], bool] = lambda: False,
+    mend: Mend = lambda old, new: new,
 ) -> Descent:
     """Minimise ``objective`` from every row of ``start`` within [low, high].
 
@@ -62,6 +66,7 @@ def descend(
         tolerance: A row ends when a step lowers its value by less than this (twice in a row).
         first_step: Length of the first step [unit of x].
         stop: Asked before every iteration; ``True`` ends the work with what there is.
+        mend: Takes the points before and after a step, (rows, D) each, to where it may lead.
     """
     x = np.clip(start, low, high)
     value, gradient = objective(x)
@@ -79,7 +84,7 @@ def descend(
         scale = np.where(fresh[live], first_step / np.maximum(norm, 1e-300), 1.0)
         scale = np.minimum(scale, 2.0 / np.maximum(norm, 1e-300))
         new_x, new_value, new_gradient, used = _line_search(
-            objective, x[live], value[live], g, direction, scale, low, high
+            objective, x[live], value[live], g, direction, scale, low, high, mend
         )
         evaluations += used
         drop = value[live] - new_value
@@ -121,12 +126,14 @@ def _line_search(
     scale: FloatArray,
     low: FloatArray,
     high: FloatArray,
+    mend: Mend,
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
     best_x, best_value, best_g = x.copy(), value.copy(), g.copy()
     open_rows = np.arange(len(x))
     used = 0
     for _ in range(HALVINGS):
         trial = np.clip(x[open_rows] + scale[open_rows, None] * direction[open_rows], low, high)
+        trial = mend(x[open_rows], trial)
         f, df = objective(trial)
         used += len(open_rows)
         slope = (g[open_rows] * (trial - x[open_rows])).sum(axis=1)

@@ -7,8 +7,9 @@ Starts. A third draws configurations from the relaxed optimum (see ``bound``) in
 rounding it, which the descent then repairs; a third repeats a good small plan, because eq. (20) and the paper's
 Table 2 show that good plans are a few good configurations repeated; the rest is random.
 
-Feasibility. Plans that break a constraint are worth nothing (−log Ψ = ∞): a descent that starts inside never
-accepts a step outside, so what comes out is feasible by construction.
+Feasibility. Every start is feasible, and of every step only those configurations move that stay so: what comes
+out is feasible by construction. Steps do not follow the edge of the allowed set, so with constraints the best
+plan of each part is then improved by random feasible steps (see ``wander``) and descents in turn.
 
 Work is cut into independent ``parts`` with their own seeds, whatever executes them: same seed, same plan.
 """
@@ -24,7 +25,8 @@ from calib_planner._arrays import FloatArray
 from calib_planner.design.criteria import Criterion
 from calib_planner.design.feasibility import Feasibility
 from calib_planner.design.information import InformationModel
-from calib_planner.design.search.descent import Descent, Objective, descend
+from calib_planner.design.search.descent import Descent, Mend, Objective, descend
+from calib_planner.design.search.wander import wander
 
 RIDGE = 1e-12
 """Added to the information of a plan, relative to its diagonal, so that singular plans stay finite."""
@@ -32,6 +34,8 @@ CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
 FINALISTS = 3
 """Plans of each chunk that are polished to the end."""
+EDGE_ROUNDS = 4
+"""Turns of random steps and descent that a constrained plan gets at most."""
 
 
 def parts(starts: int) -> tuple[int, ...]:
@@ -84,8 +88,6 @@ def plan_objective(problem: SearchProblem, size: int) -> Objective:
         diagonal += RIDGE * diagonal.mean(axis=1, keepdims=True)
         worth, slope = problem.criterion.worth_and_slope(matrix)
         usable = worth > 0
-        if problem.feasibility.constraints:
-            usable &= problem.feasibility.mask(q).reshape(len(rows), size).all(axis=1)
         safe = np.where(usable, worth, 1.0)
         gradient = info.gradient(-slope / safe[:, None, None])
         return np.where(usable, -np.log(safe), np.inf), gradient.reshape(len(rows), -1)
@@ -105,10 +107,32 @@ def search_chunk(
     rough = _descend_from(problem, size, rows, stop, 80, 1e-4)
     finalists = rough.x[np.argsort(rough.value)[:FINALISTS]]
     final = _descend_from(problem, size, finalists, stop, 200, 1e-7)
+    work = used + rough.evaluations + final.evaluations
+    if problem.feasibility.constraints:
+        final, more = _along_the_edge(problem, final, rng, stop)
+        work += more
     best = int(np.argmin(final.value))
     configurations = final.x[best].reshape(size, -1)
-    work = used + rough.evaluations + final.evaluations
     return SearchResult(configurations, -float(final.value[best]), starts, work)
+
+
+def _along_the_edge(
+    problem: SearchProblem, final: Descent, rng: np.random.Generator, stop: Callable[[], bool]
+) -> tuple[Descent, int]:
+    """Improve the best plan by random feasible steps and descents in turn, while that pays."""
+    size, best = problem.size, int(np.argmin(final.value))
+    row, value, work = final.x[best], float(final.value[best]), 0
+    for _ in range(EDGE_ROUNDS):
+        plan = row.reshape(size, -1)
+        moved = wander(problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, stop)
+        descended = _descend_from(problem, size, moved.configurations[None], stop, 60, 1e-6)
+        work += moved.evaluations + descended.evaluations
+        gained = value - float(descended.value[0])
+        if gained > 0:
+            row, value = descended.x[0], float(descended.value[0])
+        if gained < 1e-3 or stop():
+            break
+    return Descent(row[None], np.array([value]), final.iterations, work), work
 
 
 def _starts(
@@ -166,4 +190,18 @@ def _descend_from(
         iterations=iterations,
         tolerance=tolerance,
         stop=stop,
+        mend=_mend(problem.feasibility, size),
     )
+
+
+def _mend(feasibility: Feasibility, size: int) -> Mend:
+    """Of a step of a plan, what is feasible: a configuration that would leave the allowed set stays."""
+
+    def mend(old: FloatArray, new: FloatArray) -> FloatArray:
+        if not feasibility.constraints:
+            return new
+        rows = (len(new), size, -1)
+        ok = feasibility.mask(new.reshape(len(new) * size, -1)).reshape(len(new), size, 1)
+        return np.where(ok, new.reshape(rows), old.reshape(rows)).reshape(new.shape)
+
+    return mend
