@@ -29,6 +29,7 @@ from calib_planner.design.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.design.prove import Proof, prove_bound
 from calib_planner.design.search.exchange import PoolProblem, choose
 from calib_planner.design.search.multistart import SearchProblem, SearchResult, parts, search_chunk
+from calib_planner.design.search.prediction import choose_for_prediction, prediction_problem
 from calib_planner.design.space import PlanSpace, plan_space
 
 __all__ = ["Progress", "plan", "worth_of"]
@@ -230,6 +231,9 @@ def _choose(
     problem = space.problem
     pool = np.asarray(problem.candidates)
     allowed = np.flatnonzero(space.feasibility.mask(pool))
+    if problem.discrepancy is not None:
+        chosen = choose_for_prediction(prediction_problem(problem, pool[allowed]), clock.stop)
+        return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
     request = PoolProblem(
         rows=space.model.whitened(pool[allowed]),
         criterion=criterion,

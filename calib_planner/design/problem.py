@@ -16,6 +16,7 @@ from calib_planner._arrays import (
     check_number,
 )
 from calib_planner.design.criteria import CRITERIA
+from calib_planner.design.discrepancy import ModelDiscrepancy
 from calib_planner.design.feasibility import Constraint
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification.measurements import Measurements
@@ -51,6 +52,9 @@ class PlanProblem:
         constraints: Conditions on configurations besides the joint limits.
         candidates: (C, joints) configurations to choose from, instead of all within the limits.
         repeat_candidates: Whether one candidate may be chosen more than once.
+        discrepancy: What the real robot has beyond any geometric model (see ``discrepancy``). The plan is then
+            chosen from ``candidates`` for the smallest expected error at the test poses on such a robot;
+            value and bound stay those of the criterion. ``None``: the paper's plain criterion.
         starts: Random starts of the search.
         seed: Same seed, same plan.
         time_limit: Seconds after which the best plan so far is returned.
@@ -72,6 +76,7 @@ class PlanProblem:
     constraints: tuple[Constraint, ...] = ()
     candidates: ArrayLike | None = None
     repeat_candidates: bool = False
+    discrepancy: ModelDiscrepancy | None = None
     starts: int = 48
     seed: int = 0
     time_limit: float = float("inf")
@@ -103,6 +108,8 @@ class PlanProblem:
             put(self, "candidates", pool)
             if not self.repeat_candidates and len(pool) < self.configurations:
                 raise InputError("candidates", f"{len(pool)} rows", f"at least {self.configurations}, one each")
+        if self.discrepancy is not None:
+            self._check_discrepancy()
         put(self, "starts", check_count("starts", self.starts, high=100_000))
         put(self, "seed", check_count("seed", self.seed, low=0, high=2**63 - 1))
         if not self.time_limit > 0:
@@ -124,6 +131,12 @@ class PlanProblem:
         if count and ((weights < 0).any() or not weights.any()):
             raise InputError("weights", weights.tolist(), "numbers >= 0, not all zero")
         put(self, "weights", weights)
+
+    def _check_discrepancy(self) -> None:
+        if self.candidates is None:
+            raise InputError("discrepancy", "no candidates", "candidates to choose from", "draw some hundred")
+        if self.criterion != "test_pose" or self.compound:
+            raise InputError("discrepancy", f"criterion {self.criterion}", "criterion test_pose, not compound")
 
     @property
     def test_pose_array(self) -> FloatArray:
