@@ -6,23 +6,22 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from calib_planner.design.budget import Split
 from calib_planner.design.plan import Plan
+from calib_planner.design.problem import POSE_CRITERIA
 from calib_planner.robot.chain import Robot
 
 
 def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
     """Print a plan of ``robot``."""
     console.print(f"{plan.status}: {plan.message}", style="green" if plan.status == "ok" else "yellow")
-    console.print(
-        f"Predicted accuracy ρ0 {length(plan.predicted_accuracy)} at the test pose"
-        f"{'s (rms)' if len(plan.test_poses) > 1 else ''}, from {plan.measurements} measurements "
-        f"with σ = {length(plan.sigma)}."
-    )
-    console.print(
-        f"No plan of {plan.measurements} measurements is better than {length(plan.lower_bound)} "
-        f"({plan.bound} bound): efficiency {100 * plan.efficiency:.1f} %. "
-        f"Over all joint limits {length(plan.general_accuracy)} (rms)."
-    )
+    if len(plan.test_poses):
+        console.print(
+            f"Predicted accuracy ρ0 {length(plan.predicted_accuracy)} at the test pose"
+            f"{'s (rms)' if len(plan.test_poses) > 1 else ''}, from {plan.measurements} measurements "
+            f"with σ = {length(plan.sigma)}."
+        )
+    console.print(_bound(plan))
     console.print(_configurations(plan, robot))
     if len(plan.test_poses) > 1:
         per = ", ".join(length(v) for v in plan.predicted_accuracy_per_test_pose)
@@ -35,6 +34,35 @@ def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
     console.print(
         f"{plan.starts} starts, {plan.evaluations} plans evaluated, {plan.seconds:.1f} s, seed {plan.seed}"
     )
+
+
+def _bound(plan: Plan) -> str:
+    everywhere = f"Over all joint limits {length(plan.general_accuracy)} (rms)."
+    metric = plan.criterion in POSE_CRITERIA
+    value = length(plan.value) if metric else f"{plan.value:.5g}"
+    told = "" if plan.criterion == "test_pose" else f"Criterion {plan.criterion}: {value}. "
+    if plan.bound == "none":
+        return f"{told}This criterion has no bound. {everywhere}"
+    limit = length(plan.value_bound) if metric else f"{plan.value_bound:.5g}"
+    return (
+        f"{told}No plan of {plan.measurements} measurements is better than {limit} "
+        f"({plan.bound} bound): efficiency {100 * plan.efficiency:.1f} %. {everywhere}"
+    )
+
+
+def show_tried(split: Split, console: Console) -> None:
+    """Print the sizes that were tried for an accuracy or a budget."""
+    table = Table(title="sizes tried")
+    for heading in ("configurations", "each", "measurements", "ρ0"):
+        table.add_column(heading, justify="right")
+    for p in split.tried:
+        k, r = len(p.configurations), int(p.repetitions[0])
+        table.add_row(
+            str(k), f"{r}×", str(p.measurements), length(p.value), style="bold" if p is split.plan else ""
+        )
+    console.print(table)
+    if split.fewest:
+        console.print(f"No plan of fewer than {split.fewest} measurements can reach it.")
 
 
 def length(metres: float) -> str:

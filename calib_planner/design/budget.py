@@ -8,7 +8,7 @@ bound is no longer a square root; both are then simply computed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,9 @@ from calib_planner.errors import InfeasibleError, InputError
 
 MOST_MEASUREMENTS = 10_000
 TRIED = 6
-"""Numbers of configurations tried beyond the smallest."""
+"""Numbers of configurations tried one by one from the smallest; beyond them only if none of these is enough."""
+MOST_CONFIGURATIONS = 60
+"""A plan of more is no answer for an afternoon."""
 
 Watch = Callable[[int, int], None]
 """Told how many plans are done, of how many at most."""
@@ -57,9 +59,11 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
     best: Plan | None = None
     tried: list[Plan] = []
     fewest = 0
-    for k in range(smallest, smallest + TRIED):
+    for k in _sizes(smallest):
+        if k >= smallest + TRIED and best is not None:
+            break
         found = _smallest_repetition(problem, k, accuracy)
-        watch(k - smallest + 1, TRIED)
+        watch(min(k - smallest + 1, TRIED), TRIED)
         if found is None:
             continue
         tried.append(found)
@@ -72,10 +76,19 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
     if best is None:
         raise InfeasibleError(
             "accuracy",
-            f"{accuracy:g} m is not reached by {smallest} to {smallest + TRIED - 1} configurations repeated up "
-            f"to {MOST_MEASUREMENTS} measurements in all; ask for less, or lower sigma or configuration_sigma",
+            f"{accuracy:g} m is not reached by {smallest} to {MOST_CONFIGURATIONS} configurations, each repeated "
+            f"up to {MOST_MEASUREMENTS} measurements in all; ask for less, or lower sigma or configuration_sigma",
         )
     return Split(best, tuple(tried), fewest)
+
+
+def _sizes(smallest: int) -> Iterator[int]:
+    """Numbers of configurations to try: every one at first, then ever larger ones."""
+    yield from range(smallest, smallest + TRIED)
+    k = smallest + TRIED
+    while k <= MOST_CONFIGURATIONS:
+        yield k
+        k = int(np.ceil(1.25 * k))
 
 
 def _smallest_repetition(problem: PlanProblem, k: int, accuracy: float) -> Plan | None:

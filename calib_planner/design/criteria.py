@@ -92,9 +92,8 @@ class Accuracy(_Smooth):
     def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(matrices)
         half = inverse @ self.weight
-        worth = 1.0 / np.einsum("sii->s", half)
-        slope: FloatArray = (worth**2)[:, None, None] * (half @ inverse)
-        return worth, _symmetric(slope)
+        worth: FloatArray = np.reciprocal(np.einsum("sii->s", half), dtype=np.float64)
+        return worth, _symmetric((worth**2)[:, None, None] * (half @ inverse))
 
 
 @dataclass(frozen=True)

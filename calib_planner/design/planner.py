@@ -22,6 +22,7 @@ from calib_planner.design.criteria import (
     efficiency,
     reported_value,
 )
+from calib_planner.design.identifiability import NO_LEVER
 from calib_planner.design.information import covariance, error_variance
 from calib_planner.design.order import visiting_order
 from calib_planner.design.plan import STATUS, Plan
@@ -260,7 +261,8 @@ def _assemble(
     clock: _Clock,
 ) -> Plan:
     problem, robot = space.problem, space.robot
-    configurations = found.configurations[visiting_order(found.configurations, robot)]
+    configurations = _rest_idle_joints(space, found.configurations)
+    configurations = configurations[visiting_order(configurations, robot)]
     matrix = space.model.at(configurations).sum(axis=0) + space.prior
     inverse, hidden = covariance(matrix)
     per = np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
@@ -313,6 +315,19 @@ def _assemble(
         starts=found.starts,
         evaluations=found.evaluations,
     )
+
+
+def _rest_idle_joints(space: PlanSpace, configurations: FloatArray) -> FloatArray:
+    """Joints that move no target stay where the first test pose, or the middle of their range, has them."""
+    problem = space.problem
+    if problem.candidates is not None:
+        return configurations
+    low, high = space.robot.joint_limits.T
+    q = np.random.default_rng(0).uniform(low, high, (64, len(low)))
+    idle = np.abs(space.robot.joint_jacobian(q)).max(axis=(0, 1)) < NO_LEVER
+    tests = problem.test_pose_array
+    rested = np.where(idle, tests[0] if len(tests) else (low + high) / 2, configurations)
+    return rested if space.feasibility.mask(rested).all() else configurations
 
 
 def _efficiency(name: str, worth: float, bound: float, value: float, value_bound: float) -> float:

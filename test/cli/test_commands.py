@@ -205,3 +205,74 @@ def test_ur10(call: Any, tmp_path: Path) -> None:
     assert result["validation"]["count"] == 800
     assert result["validation"]["before_mean"] == pytest.approx(0.91e-3, rel=0.1)
     assert result["validation"]["mean"] == pytest.approx(0.50e-3, rel=0.1)
+
+
+# ── sizes, criteria and the baseline ─────────────────────────────────────────────────────────────────
+
+POSED = ["--robot", "kuka_kr270", "--degrees", "--test-pose", POSE, "--starts", "12"]
+RADIANS = ["--robot", "kuka_kr270", "--test-pose", "0 -1 1.5 0 0.8 0", "--starts", "12"]
+
+
+def test_accuracy_and_measurements(call: Any) -> None:
+    found = call("plan", *POSED, "--accuracy", "0.02e-3", "--json")
+    assert found["predicted_accuracy"] <= 0.02e-3
+    assert found["fewest_measurements"] <= sum(found["repetitions"])
+    split = call("plan", *POSED, "--measurements", "12", "--json")
+    assert sum(split["repetitions"]) == 12
+    assert len(split["tried"]) == 4
+
+
+def test_criterion_and_compound(call: Any) -> None:
+    found = call("plan", "--robot", "kuka_kr270", "--criterion", "d", "--configurations", "5", "--json")
+    assert found["value"] <= found["value_bound"]
+    assert found["lower_bound"] is None
+    assert found["efficiency"] == pytest.approx(found["value"] / found["value_bound"])
+    mixed = call("plan", *POSED, "--compound", "d=0.3", "--configurations", "5", "--json")
+    assert mixed["criterion"] == "compound"
+    assert 0.5 < mixed["efficiency"] <= 1
+
+
+def test_next_configurations_after_measured_ones(call: Any, tmp_path: Path) -> None:
+    plan, points, prior = (str(tmp_path / n) for n in ("plan.yaml", "points.csv", "prior.yaml"))
+    first = call("plan", *RADIANS, "--configurations", "4", "--output", plan, "--json")
+    call("simulate", "--robot", "kuka_kr270", "--plan", plan, "--output", points, "--json")
+    Path(prior).write_text("q1: 1.0e-4\n")
+    more = call("plan", *RADIANS, "--configurations", "1", "--measured", points, "--prior", prior, "--json")
+    assert more["predicted_accuracy"] < first["predicted_accuracy"]
+
+
+def test_candidates(call: Any, tmp_path: Path) -> None:
+    path = tmp_path / "pool.csv"
+    robot = Robot.load("kuka_kr270")
+    low, high = robot.joint_limits.T
+    pool = np.random.default_rng(0).uniform(low, high, (60, 6))
+    rows = [",".join(robot.joint_names), *(",".join(map(repr, row)) for row in pool.tolist())]
+    path.write_text("\n".join(rows) + "\n")
+    found = call("plan", *RADIANS, "--candidates", str(path), "--configurations", "6", "--json")
+    chosen = {tuple(row) for row in found["configurations"]}
+    assert len(chosen) == 6
+    assert chosen <= {tuple(row) for row in pool.tolist()}
+
+
+def test_compare(call: Any) -> None:
+    found = call("compare", *POSED, "--configurations", "3", "--replicate", "3x4", "--random", "200", "--json")
+    assert [c["label"] for c in found["columns"]] == ["3", "3x4"]
+    for column in found["columns"]:
+        assert column["lower_bound"] <= column["proposed"] <= column["random"]["min"]
+
+
+@pytest.mark.parametrize(
+    ("words", "needle"),
+    [
+        (["plan", *POSED], "one of the arguments"),
+        (["plan", *POSED, "--configurations", "4", "--accuracy", "1e-3"], "not allowed with"),
+        (["plan", *POSED, "--measurements", "12", "--repetitions", "2"], "--configurations"),
+        (["plan", *POSED, "--configurations", "4", "--compound", "d"], "NAME=SHARE"),
+        (["plan", *POSED, "--configurations", "4", "--compound", "x=0.2"], "one of"),
+        (["compare", *POSED], "--replicate"),
+        (["compare", *POSED, "--replicate", "3by4"], "KxR"),
+    ],
+)
+def test_wrong_sizes(words: list[str], needle: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert needle in capsys.readouterr().err
