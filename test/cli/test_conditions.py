@@ -25,7 +25,7 @@ def test_a_plan_obeys_the_file_and_uses_the_instrument(capsys):
     feasible = Feasibility(robot, read_constraints(constraints, robot))
     assert feasible.mask(np.array(found["configurations"])).all()
     assert 0 < found["lower_bound"] <= found["predicted_accuracy"]
-    assert found["sigma"] == 1.377e-05 or 1e-5 < found["sigma"] < 2e-5
+    assert 1e-5 < found["sigma"] < 2e-5
 
 
 def test_an_empty_set_is_status_1_and_names_the_constraint(tmp_path, capsys):
@@ -37,9 +37,9 @@ def test_an_empty_set_is_status_1_and_names_the_constraint(tmp_path, capsys):
     assert "workspace box" in err and "allows 0 %" in err
 
 
-def test_wrong_files_are_status_2(tmp_path, capsys):
+def test_wrong_files_are_named(tmp_path, capsys):
     path = tmp_path / "c.yaml"
     path.write_text("workspace: {low: [8, 8, 8]}")
     for option in ("--constraints", "--instrument"):
-        assert main([*PLAN, "--configurations", "4", option, str(path)]) == 2
+        assert main([*PLAN, "--configurations", "4", option, str(path)]) == 1
         assert str(path) in capsys.readouterr().err

@@ -57,10 +57,10 @@ class SelfCollision:
         path = Path(self.urdf_path).expanduser()
         if not path.is_file():
             raise FileFormatError(path, "file", "no such file", "a URDF with collision geometry")
-        folders = [str(self.package_folder or path.parent)]
+        folders, kind = [str(self.package_folder or path.parent)], pin.GeometryType.COLLISION
         try:
             model = pin.buildModelFromUrdf(str(path))
-            geometry = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.COLLISION, folders)
+            geometry = pin.buildGeomFromUrdf(model, str(path), kind, package_dirs=folders)
         except (ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())
             raise FileFormatError(path, "URDF", reason, "a URDF with collision geometry") from None
