@@ -15,7 +15,11 @@ So axes and columns of the elements are all that positions, the identification J
 derivatives need. ``compile_program`` walks the chain once with symbols in place of numbers. Products with
 0 and ±1, shared subexpressions and results that nobody asked for vanish there; what is left runs over a
 block of configurations at a time, one contiguous vector per scalar quantity (structure of arrays), in
-buffers that stay in the cache. The program depends on the chain's *structure* (which amounts are zero or
+buffers that stay in the cache. Sines and cosines of all joints come from one tangent of the half angle,
+
+    t = tan(q/2),   d = 2/(1 + t²),   cos q = d − 1,   sin q = t·d,
+
+which NumPy vectorises where it does not vectorise sine and cosine. The program depends on the chain's *structure* (which amounts are zero or
 quarter turns), not on its numbers, so that one program serves a whole identification.
 """
 
@@ -31,7 +35,7 @@ from numpy.typing import NDArray
 
 from calib_planner.robot.elements import Element
 
-BLOCK = 1024
+BLOCK = 2048
 """Configurations per pass: the live vectors of a six-joint robot then fit the second-level cache."""
 
 GENERAL = -1
@@ -201,6 +205,8 @@ class Program:
     Attributes:
         scalars: Operations on plain numbers, done once per call: ``(op, a, b, node)``.
         vectors: Operations on blocks: ``(ufunc, a, b, slot)``, slots index a table of operands.
+        turns: ``(joint, node, cos slot, sin slot)``: joint angles whose cosine and sine are needed, the scalar
+            ``node`` (0 for none) being added to the joint.
         joints: ``(slot, joint)`` pairs: where joint vectors are read.
         constants: ``(slot, node)`` pairs: where scalar results enter the vector part.
         copies: ``(row, sign, slot)``: outputs that are (negated) copies; sign 0 means zero.
@@ -212,6 +218,7 @@ class Program:
 
     scalars: tuple[tuple[str, int, int, int], ...]
     vectors: tuple[tuple[Callable[..., Any], int, int, int], ...]
+    turns: tuple[tuple[int, int, int, int], ...]
     joints: tuple[tuple[int, int], ...]
     constants: tuple[tuple[int, int], ...]
     copies: tuple[tuple[int, int, int], ...]
@@ -238,20 +245,24 @@ class Program:
         table: list[Any] = [None] * self.slots
         for slot, node in self.constants:
             table[slot] = dtype.type(numbers[node])
-        scratch = np.empty((1 + max((r for _, r in self.registers), default=-1), BLOCK), dtype)
+        width = min(BLOCK, count)
+        scratch = np.empty((1 + max((r for _, r in self.registers), default=-1), width), dtype)
+        angles, waves = np.empty((len(self.turns), width), dtype), np.empty((2, len(self.turns), width), dtype)
         for start in range(0, count, BLOCK):
             stop = min(start + BLOCK, count)
             block = out[:, start:stop]
             table[: self.rows] = block
             for slot, joint in self.joints:
                 table[slot] = q[joint, start:stop]
-            for slot, register in self.registers:
-                table[slot] = scratch[register, : stop - start]
+            if start == 0 or stop - start < width:
+                views = scratch[:, : stop - start]
+                for slot, register in self.registers:
+                    table[slot] = views[register]
+                for index, (_, _, cos, sin) in enumerate(self.turns):
+                    table[cos], table[sin] = waves[:, index, : stop - start]
+            self._turn(q[:, start:stop], numbers, angles[:, : stop - start], waves[:, :, : stop - start])
             for ufunc, a, b, slot in self.vectors:
-                if b < 0:
-                    ufunc(table[a], table[slot])
-                else:
-                    ufunc(table[a], table[b], table[slot])
+                ufunc(table[a], table[b], table[slot])
             for row, sign, slot in self.copies:
                 if sign == 0:
                     block[row] = 0.0
@@ -260,6 +271,20 @@ class Program:
                 else:
                     np.negative(table[slot], block[row])
         return out
+
+    def _turn(self, q: NDArray[Any], numbers: dict[int, Any], angles: NDArray[Any], waves: NDArray[Any]) -> None:
+        """Cosines and sines of the joint angles of one block, (turns, n), into ``waves`` (2, turns, n)."""
+        for row, (joint, node, _, _) in zip(angles, self.turns, strict=True):
+            np.multiply(q[joint], 0.5, row)
+            if node:
+                row += 0.5 * numbers[node]
+        cos, sin = waves
+        np.tan(angles, angles)
+        np.multiply(angles, angles, cos)
+        cos += 1.0
+        np.divide(2.0, cos, cos)
+        np.multiply(angles, cos, sin)
+        cos -= 1.0
 
     def _run_scalars(self, amounts: NDArray[Any]) -> dict[int, Any]:
         numbers: dict[int, Any] = {0: 1.0}
@@ -277,35 +302,75 @@ class Program:
 
 @lru_cache(maxsize=256)
 def compile_program(structure: Structure) -> Program:
-    """Trace the chain with symbols and lay the result out as a program."""
+    """Trace the chain with symbols and lay the result out as a program.
+
+    The chain may be traced in the base frame, or in the frame behind its first turning joint with the results
+    turned into the base frame at the end: an arm that moves in a plane there is mostly zeros. The shorter
+    program is kept.
+    """
+    candidates = [_trace(structure, split) for split in (0, _first_turn(structure))]
+    return min(candidates, key=lambda program: len(program.vectors) + len(program.copies))
+
+
+def _first_turn(structure: Structure) -> int:
+    """Number of trunk elements up to and with the first turning joint."""
+    for index, (kind, joint, _, _) in enumerate(structure.trunk):
+        if kind[0] == "R" and joint is not None:
+            return index + 1
+    return 0
+
+
+def _trace(structure: Structure, split: int) -> Program:
+    """The program with the trunk traced from a frame of its own behind its first ``split`` elements."""
     tracer = _Tracer()
-    frame = _Frame([ZERO] * 3, [[ONE, ZERO, ZERO], [ZERO, ONE, ZERO], [ZERO, ZERO, ONE]])
-    seen = _walk(tracer, frame, structure.trunk, 0)
-    behind = [origin for _, origin, _ in seen[1:]] + [list(frame.origin)]
+    outer = _unit_frame()
+    seen = _walk(tracer, outer, structure.trunk[:split], 0)
+    behind = [origin for _, origin, _ in seen[1:]] + [list(outer.origin)] * bool(split)
+    frame = _unit_frame()
+    seen += _walk(tracer, frame, structure.trunk[split:], split)
+    behind += [origin for _, origin, _ in seen[split + 1 :]] + [list(frame.origin)]
     owner: list[int | None] = [None] * len(seen)
-    points = []
+    inner_points = []
     for target, branch in enumerate(structure.branches):
         local = frame.copy()
         seen += _walk(tracer, local, branch, len(seen))
         owner += [target] * len(branch)
-        points.append(local.origin)
+        inner_points.append(local.origin)
+    points = [_to_base(tracer, outer, point, at=True) for point in inner_points]
     outputs = [ref for point in points for ref in point]
     for e in structure.columns:
         axis, origin, rotates = seen[e]
         sign = _element_sign(structure, e)
-        for target, point in enumerate(points):
+        for target, point in enumerate(inner_points if e >= split else points):
             if owner[e] not in (None, target):
                 outputs += [ZERO] * 3
                 continue
             arm = [tracer.sub(p, o) for p, o in zip(point, origin, strict=True)]
             column = tracer.cross(axis, arm) if rotates else axis
+            column = _to_base(tracer, outer, column) if e >= split else column
             outputs += [(sign * s, n) for s, n in column]
     for e in structure.axes:
         sign = _element_sign(structure, e)
-        outputs += [(sign * s, n) for s, n in seen[e][0]]
+        axis = _to_base(tracer, outer, seen[e][0]) if e >= split else seen[e][0]
+        outputs += [(sign * s, n) for s, n in axis]
     for e in structure.origins:
-        outputs += behind[e]
+        outputs += _to_base(tracer, outer, behind[e], at=True) if e >= split else behind[e]
     return _lay_out(tracer, outputs, (len(points), len(structure.columns), len(structure.axes)))
+
+
+def _unit_frame() -> _Frame:
+    return _Frame([ZERO] * 3, [[ONE, ZERO, ZERO], [ZERO, ONE, ZERO], [ZERO, ZERO, ONE]])
+
+
+def _to_base(tracer: _Tracer, frame: _Frame, vector: Sequence[Ref], *, at: bool = False) -> list[Ref]:
+    """A vector (or, with ``at``, a point) of ``frame`` in the base frame."""
+    result = []
+    for i in range(3):
+        total = frame.origin[i] if at else ZERO
+        for j in range(3):
+            total = tracer.add(total, tracer.mul(frame.axes[j][i], vector[j]))
+        result.append(total)
+    return result
 
 
 def _element_sign(structure: Structure, e: int) -> int:
@@ -317,8 +382,6 @@ _UFUNCS: dict[str, Callable[..., Any]] = {
     "mul": np.multiply,
     "add": np.add,
     "sub": np.subtract,
-    "cos": np.cos,
-    "sin": np.sin,
 }
 
 
@@ -327,7 +390,7 @@ def _lay_out(tracer: _Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -
     needed = _needed(tracer, outputs)
     rows = len(outputs)
     home: dict[int, int] = {}
-    computed = {n for n in needed if tracer.is_vector[n] and tracer.nodes[n][0] != "joint"}
+    computed = {n for n in needed if tracer.is_vector[n] and tracer.nodes[n][0] in _UFUNCS}
     for row, (sign, node) in enumerate(outputs):
         if sign > 0 and node in computed and node not in home:
             home[node] = row
@@ -346,10 +409,14 @@ def _lay_out(tracer: _Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -
     used = 0
     for node in needed:
         op, a, _ = tracer.nodes[node]
-        if op == "joint" or not tracer.is_vector[node]:
-            home[node] = slots
-            (joints if op == "joint" else constants).append((slots, a if op == "joint" else node))
-            slots += 1
+        if node in computed:
+            continue
+        home[node] = slots
+        slots += 1
+        if op == "joint":
+            joints.append((home[node], a))
+        elif not tracer.is_vector[node]:
+            constants.append((home[node], node))
     vectors = []
     held: dict[int, int] = {}
     for step, node in enumerate(order):
@@ -361,8 +428,7 @@ def _lay_out(tracer: _Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -
             registers.append((slots, register))
             slots += 1
         op, a, b = tracer.nodes[node]
-        second = home[b] if op in ("mul", "add", "sub") else -1
-        vectors.append((_UFUNCS[op], home[a], second, home[node]))
+        vectors.append((_UFUNCS[op], home[a], home[b], home[node]))
         for operand in _operands(tracer, node):
             if last_use[operand] == step and operand in held:
                 free.append(held.pop(operand))
@@ -375,10 +441,11 @@ def _lay_out(tracer: _Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -
     return Program(
         scalars=tuple(scalars),
         vectors=tuple(vectors),
+        turns=_turns(tracer, needed, home, slots),
         joints=tuple(joints),
         constants=tuple(constants),
         copies=tuple(copies),
-        slots=slots,
+        slots=slots + 1,
         registers=tuple(registers),
         rows=rows,
         shape=shape,
@@ -389,7 +456,34 @@ def _operands(tracer: _Tracer, node: int) -> tuple[int, ...]:
     op, a, b = tracer.nodes[node]
     if op in ("mul", "add", "sub"):
         return (a,) if a == b else (a, b)
-    return (a,) if op in ("cos", "sin") else ()
+    if op in ("cos", "sin"):
+        # A joint's angle is made by ``Program._turn``; only its constant part is an operand here.
+        return tuple(n for n in _angle(tracer, a)[1:] if n) if tracer.is_vector[node] else (a,)
+    return ()
+
+
+def _angle(tracer: _Tracer, node: int) -> tuple[int, int]:
+    """A joint angle's node taken apart: the joint, and the scalar node added to it or 0."""
+    op, a, b = tracer.nodes[node]
+    if op == "joint":
+        return a, 0
+    joint, constant = (a, b) if tracer.is_vector[a] else (b, a)
+    return tracer.nodes[joint][1], constant
+
+
+def _turns(
+    tracer: _Tracer, needed: list[int], home: dict[int, int], nowhere: int
+) -> tuple[tuple[int, int, int, int], ...]:
+    """Each joint angle once, with the slots of its cosine and sine (``nowhere`` if not needed)."""
+    places: dict[int, dict[str, int]] = {}
+    for node in needed:
+        op, a, _ = tracer.nodes[node]
+        if op in ("cos", "sin") and tracer.is_vector[node]:
+            places.setdefault(a, {})[op] = home[node]
+    found = []
+    for angle, place in places.items():
+        found.append((*_angle(tracer, angle), place.get("cos", nowhere), place.get("sin", nowhere)))
+    return tuple(found)
 
 
 def _needed(tracer: _Tracer, outputs: list[Ref]) -> list[int]:
