@@ -31,7 +31,7 @@ def test_tip_and_axes_agree_with_positions(case, placed):
         robot = robot.with_base(Rotation.from_euler("xyz", [0.3, -0.2, 2.0]).as_matrix(), [1.0, 2.0, -0.5])
     q = random_configurations(robot, 1500, 3)  # more than a block
     posture = robot.posture(q)
-    np.testing.assert_array_equal(posture.targets, robot.positions(q))
+    np.testing.assert_allclose(posture.targets, robot.positions(q), atol=1e-14)
     expected = posture.tip_origin[:, None] + robot.target_offsets @ posture.tip_rotation.transpose(0, 2, 1)
     np.testing.assert_allclose(posture.targets, expected, atol=1e-13)
     columns = robot.joint_jacobian(q).reshape(len(q), len(robot.targets), 3, -1)
@@ -67,17 +67,17 @@ def test_segments_join_base_joints_and_tip():
     posture = robot.posture(random_configurations(robot, 7))
     start, end = segments(robot, posture)
     assert start.shape == end.shape == (7, 5, 3)
-    np.testing.assert_array_equal(start[:, 0], np.tile([1.0, 2.0, 3.0], (7, 1)))
-    np.testing.assert_array_equal(start[:, 1:], end[:, :-1])
-    np.testing.assert_array_equal(end[:, -1], posture.tip_origin)
+    np.testing.assert_allclose(start[:, 0], np.tile([1.0, 2.0, 3.0], (7, 1)), atol=1e-14)
+    np.testing.assert_allclose(start[:, 1:], end[:, :-1], atol=1e-14)
+    np.testing.assert_allclose(end[:, -1], posture.tip_origin, atol=1e-14)
 
 
 def test_radii():
     robot = Robot.load("planar_2r")
     length = sum(p.nominal for p in robot.parameters if p.name.startswith("l"))
     np.testing.assert_allclose(Capsules().of(robot), [SLENDERNESS * length] * 3)
-    np.testing.assert_array_equal(Capsules(0.2).of(robot), [0.2] * 3)
-    np.testing.assert_array_equal(Capsules([0.3, 0.2, 0.1]).of(robot), [0.3, 0.2, 0.1])
+    np.testing.assert_allclose(Capsules(0.2).of(robot), [0.2] * 3, atol=1e-14)
+    np.testing.assert_allclose(Capsules([0.3, 0.2, 0.1]).of(robot), [0.3, 0.2, 0.1], atol=1e-14)
     with pytest.raises(InputError, match="base column, then behind q1, q2"):
         Capsules([0.1, 0.2]).of(robot)
     for bad in (-0.1, [0.1, np.nan], []):
