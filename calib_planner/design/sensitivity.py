@@ -55,16 +55,15 @@ def square_root(slope: FloatArray) -> FloatArray:
 def sensitivity(model: InformationModel, root: FloatArray, q: FloatArray) -> tuple[FloatArray, float]:
     """d (N,) and the largest error of the computed values."""
     assert isinstance(model.noise, Isotropic)
-    variance = model.noise.sigma**2 + model.configuration_sigma**2
     steps = len(model.robot.elements) + 3 + 2 * len(root)
     parts, largest = [], 0.0
     for start in range(0, len(q), 8192):
-        jacobian = np.ascontiguousarray(model.robot.jacobian(q[start : start + 8192]))
-        seen = jacobian @ root
-        parts.append(np.einsum("nij,nij->n", seen, seen) / variance)
-        largest = max(largest, float(np.einsum("nij,nij->n", jacobian, jacobian).max()))
+        rows = model.whitened(q[start : start + 8192])
+        seen = rows @ root
+        parts.append(np.einsum("nij,nij->n", seen, seen))
+        largest = max(largest, float(np.einsum("nij,nij->n", rows, rows).max()))
     d = np.concatenate(parts)
-    error = 4.0 * EPS * steps * float(np.sqrt(largest / variance) * np.linalg.norm(root))
+    error = 4.0 * EPS * steps * float(np.sqrt(largest) * np.linalg.norm(root))
     return d, 2.0 * error * float(np.sqrt(d.max())) + error**2
 
 
