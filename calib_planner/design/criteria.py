@@ -92,8 +92,8 @@ class Accuracy(_Smooth):
     def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(matrices)
         half = inverse @ self.weight
-        worth: FloatArray = np.reciprocal(np.einsum("sii->s", half), dtype=np.float64)
-        return worth, _symmetric((worth**2)[:, None, None] * (half @ inverse))
+        worth = 1.0 / np.einsum("sii->s", half)
+        return np.asarray(worth, np.float64), _symmetric((worth**2)[:, None, None] * (half @ inverse))
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class WorstAccuracy:
 
     def _values(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(matrices)
-        return inverse, np.einsum("sab,kba->sk", inverse, self.weights)
+        return np.asarray(inverse, np.float64), np.einsum("sab,kba->sk", inverse, self.weights)
 
     def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse, values = self._values(matrices)

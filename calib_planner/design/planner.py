@@ -318,15 +318,22 @@ def _assemble(
 
 
 def _rest_idle_joints(space: PlanSpace, configurations: FloatArray) -> FloatArray:
-    """Joints that move no target stay where the first test pose, or the middle of their range, has them."""
+    """Joints that change no measurement stay where the first test pose, or mid-range, has them."""
     problem = space.problem
     if problem.candidates is not None:
         return configurations
     low, high = space.robot.joint_limits.T
-    q = np.random.default_rng(0).uniform(low, high, (64, len(low)))
-    idle = np.abs(space.robot.joint_jacobian(q)).max(axis=(0, 1)) < NO_LEVER
     tests = problem.test_pose_array
-    rested = np.where(idle, tests[0] if len(tests) else (low + high) / 2, configurations)
+    rest = tests[0] if len(tests) else (low + high) / 2
+    q, other = np.random.default_rng(0).uniform(low, high, (2, 64, len(low)))
+    points, information = space.robot.positions(q), space.model.at(q)
+    rested = configurations.copy()
+    for joint in range(len(low)):
+        moved = q.copy()
+        moved[:, joint] = other[:, joint]
+        still = np.allclose(space.robot.positions(moved), points, rtol=0, atol=NO_LEVER)
+        if still and np.allclose(space.model.at(moved), information, rtol=1e-9, atol=1e-9 * information.max()):
+            rested[:, joint] = rest[joint]
     return rested if space.feasibility.mask(rested).all() else configurations
 
 
