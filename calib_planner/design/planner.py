@@ -33,6 +33,9 @@ from calib_planner.design.search.multistart import SearchProblem, SearchResult, 
 from calib_planner.design.search.prediction import choose_for_prediction, prediction_problem
 from calib_planner.design.space import PlanSpace, plan_space
 
+GOOD_ENOUGH = 0.012
+"""Distance of a plan's worth from its bound, as a share, at which the search ends; half as much in ρ0."""
+
 __all__ = ["Progress", "plan", "worth_of"]
 
 
@@ -187,7 +190,7 @@ def _search(
     clock: _Clock,
     executor: Executor | None,
 ) -> SearchResult:
-    """All chunks, here or by the executor; the best of them, the first one if equal."""
+    """All parts, here or by the executor, until one is good enough; the best of them, the first one if equal."""
     nobody = np.empty((0, len(space.robot.joint_names)))
     search = SearchProblem(
         model=space.model,
@@ -202,23 +205,28 @@ def _search(
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
     best: SearchResult | None = None
     done = evaluations = 0
-    futures = [executor.submit(search_chunk, *job) for job in work] if executor else None
+    futures = [executor.submit(search_chunk, *job) for job in work] if executor else []
     for index, job in enumerate(work):
-        if futures is not None:
-            if index and clock.stop():
-                futures[index].cancel()
-                continue
-            result = futures[index].result()
-        else:
-            if index and clock.stop():
-                break
-            result = search_chunk(*job, clock.stop)
+        if index and (clock.stop() or _good_enough(space, relaxed, best)):
+            break
+        result = futures[index].result() if futures else search_chunk(*job, clock.stop)
         done, evaluations = done + result.starts, evaluations + result.evaluations
         if best is None or result.log_worth > best.log_worth:
             best = result
         clock.tell(done, best.log_worth)
+    for future in futures:
+        future.cancel()
     assert best is not None
     return replace(best, starts=done, evaluations=evaluations)
+
+
+def _good_enough(space: PlanSpace, relaxed: RelaxedDesign | None, best: SearchResult | None) -> bool:
+    """Whether the best plan is so near its bound that more starts cannot pay."""
+    if relaxed is None or best is None or space.problem.compound:
+        return False
+    matrix = space.model.at(best.configurations).sum(axis=0) + space.prior
+    worth = space.criterion(space.problem.criterion).exact(matrix)
+    return worth >= (1.0 - GOOD_ENOUGH) * relaxed.bound
 
 
 def _choose(

@@ -1,0 +1,91 @@
+"""How near the bound the planner comes, and in what time: kuka_kr270, nine parameters, default settings.
+
+50 random test poses within the joint limits; for each number of configurations the distribution of the efficiency
+and of the seconds per plan. Then the cost against the size of the request: measurements, test poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+
+import numpy as np
+
+from calib_planner import PlanProblem, Robot, plan
+from calib_planner.design.information import InformationModel
+from calib_planner.design.space import plan_space
+
+TARGETS = {3: 0.94, 4: 0.985, 6: 0.99, 12: 0.99}
+"""Configurations: smallest efficiency wanted."""
+
+
+def efficiencies(robot: Robot, poses: np.ndarray) -> list[dict[str, float]]:
+    rows = []
+    for m, wanted in TARGETS.items():
+        plans = [plan(PlanProblem(robot, pose, m)) for pose in poses]
+        e, t = (np.array([getattr(p, name) for p in plans]) for name in ("efficiency", "seconds"))
+        row = {
+            "configurations": m, "wanted": wanted, "poses": len(poses),
+            "median": float(np.median(e)), "worst": float(e.min()), "below": int((e < wanted).sum()),
+            "seconds_median": float(np.median(t)), "seconds_worst": float(t.max()),
+        }  # fmt: skip
+        rows.append(row)
+        print(
+            f"m = {m:>2}: efficiency median {row['median']:.4f}, worst {row['worst']:.4f} (wanted {wanted}, "
+            f"{row['below']} of {len(poses)} below); {row['seconds_median']:.2f} s median, "
+            f"{row['seconds_worst']:.2f} s worst",
+            file=sys.stderr,
+        )
+    return rows
+
+
+def seconds_of(work) -> float:  # type: ignore[no-untyped-def]
+    times = []
+    for _ in range(5):
+        began = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
+
+
+def scaling(robot: Robot) -> dict[str, dict[int, float]]:
+    """Seconds per evaluation of value and gradient (by m), of a pool's information (by C), of K test poses."""
+    low, high = robot.joint_limits.T
+    rng = np.random.default_rng(0)
+    pose = rng.uniform(low, high, 6)
+    model = plan_space(PlanProblem(robot, pose, 4)).single
+    assert isinstance(model, InformationModel)
+    slope = np.eye(9)[None]
+    table: dict[str, dict[int, float]] = {"configurations": {}, "candidates": {}, "test_poses": {}}
+    for m in (1_000, 2_000, 4_000, 8_000, 16_000):
+        q = rng.uniform(low, high, (m, 6))
+
+        def value_and_gradient(q: np.ndarray = q, m: int = m) -> None:
+            info = model.linearised(q)
+            info.sums(m)
+            info.gradient(slope)
+
+        table["configurations"][m] = seconds_of(value_and_gradient)
+        table["candidates"][m] = seconds_of(lambda q=q: model.at(q))
+        table["test_poses"][m] = seconds_of(lambda q=q: plan_space(PlanProblem(robot, q, 4)))
+    for name, row in table.items():
+        first = min(row)
+        shares = ", ".join(f"{n}: {t / row[first] / (n / first):.2f}" for n, t in row.items())
+        print(f"time per {name[:-1].replace('_', ' ')}, relative to {first}: {shares}", file=sys.stderr)
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--poses", type=int, default=50)
+    args = parser.parse_args()
+    robot = Robot.load("kuka_kr270")
+    low, high = robot.joint_limits.T
+    poses = np.random.default_rng(2026).uniform(low, high, (args.poses, 6))
+    print(json.dumps({"efficiency": efficiencies(robot, poses), "scaling": scaling(robot)}))
+
+
+if __name__ == "__main__":
+    main()
