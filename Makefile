@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo test lint bench clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -17,6 +17,10 @@ test: setup ## run every test (more options: make test PYTEST='-k plan')
 
 lint: setup ## ruff and mypy
 	@. ./env.sh && ruff check . && ruff format --check . && mypy
+
+bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (minutes; JSON to results/)
+	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot; do \
+	  echo "== $$name"; python bench/$$name.py > results/$$name.json || exit 1; done
 
 clean: ## remove what was made: .venv, build, install, log, caches
 	rm -rf .venv build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from calib_planner.cli.arguments import (
@@ -17,11 +18,13 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.conditions import add_conditions, conditions
 from calib_planner.design.criteria import CRITERIA
+from calib_planner.design.discrepancy import ModelDiscrepancy
 from calib_planner.design.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.errors import InputError
 from calib_planner.files.configurations_csv import read_configurations
 from calib_planner.files.document import read_mapping
 from calib_planner.files.measurements_csv import read_measurements
+from calib_planner.robot.catalogue import URDF_SUFFIXES
 from calib_planner.robot.chain import Robot
 
 DEFAULTS = {name: field.default for name, field in PlanProblem.__dataclass_fields__.items()}
@@ -85,6 +88,13 @@ def _add_criteria(group: argparse._ArgumentGroup) -> None:
         "--candidates", metavar="FILE", help="CSV of joint configurations to choose from, one per row"
     )
     group.add_argument(
+        "--discrepancy",
+        choices=("auto", "on", "off"),
+        default="auto",
+        help="expect the systematic errors of a real robot when choosing candidates; auto: for robots from a "
+        "URDF; off: the paper's white noise alone",
+    )
+    group.add_argument(
         "--repeat-candidates", action="store_true", help="a candidate may be chosen more than once"
     )
 
@@ -115,11 +125,22 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         prior_std=_prior(args.prior),
         measured=_measured(args, robot),
         candidates=_candidates(args, robot),
+        discrepancy=_discrepancy(args, robot),
         repeat_candidates=getattr(args, "repeat_candidates", False),
         starts=args.starts,
         seed=args.seed,
         time_limit=args.time_limit,
     )
+
+
+def _discrepancy(args: argparse.Namespace, robot: Robot) -> ModelDiscrepancy | None:
+    """What a real robot has beyond its geometric model, where that is asked for or to be expected."""
+    wanted = getattr(args, "discrepancy", "off")
+    if wanted == "auto":
+        plain = args.criterion == "test_pose" and not args.compound and not args.repeat_candidates
+        real = Path(robot.source).suffix.lower() in URDF_SUFFIXES
+        wanted = "on" if real and plain and args.candidates is not None else "off"
+    return ModelDiscrepancy() if wanted == "on" else None
 
 
 def _compound(words: list[str]) -> dict[str, float]:

@@ -295,6 +295,10 @@ def _assemble(
     status = "singular" if hidden.size and status == "ok" else status
     combinations = space.identifiability.combinations
     note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}." if combinations else ""
+    if problem.discrepancy is not None:
+        note += (
+            " Chosen for a robot with systematic errors; value, bound and efficiency are for white noise alone."
+        )
     note += f" {proof.text}" if proof else ""
     return Plan(
         robot=robot.name,

@@ -137,6 +137,8 @@ class PlanProblem:
             raise InputError("discrepancy", "no candidates", "candidates to choose from", "draw some hundred")
         if self.criterion != "test_pose" or self.compound:
             raise InputError("discrepancy", f"criterion {self.criterion}", "criterion test_pose, not compound")
+        if self.repeat_candidates:
+            raise InputError("discrepancy", "repeat_candidates", "candidates chosen once each")
 
     @property
     def test_pose_array(self) -> FloatArray:

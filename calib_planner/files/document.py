@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 from calib_planner.errors import FileFormatError
 from calib_planner.files.text import read_text, write_text
 
+UNICODE_BREAKS = ("\x85", "\u2028", "\u2029")
+"""Line breaks beyond ASCII's, which YAML reads as white space inside a text."""
+
 
 class _Loader(yaml.SafeLoader):
     """The safe loader, without aliases: a few lines of them can stand for gigabytes."""
@@ -27,6 +30,8 @@ def write_document(path: str | Path, kind: str, content: Mapping[str, Any], fiel
     """Write ``content`` below a line that says what it is; floats are exact to the bit."""
     plain = {"format": f"calib_planner/{kind}", **{k: _plain(v) for k, v in content.items()}}
     text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=100)
+    if any(mark in text for mark in UNICODE_BREAKS):
+        text = yaml.safe_dump(plain, sort_keys=False, width=100)  # escaped: YAML folds these into spaces
     write_text(path, text, field)
 
 

@@ -46,7 +46,7 @@ def test_segment_distance_is_the_minimum(a, b, c, d):
 def test_nearly_parallel_segments(tilt, shift):
     a, b = np.zeros(3), np.array([1.0, 0.0, 0.0])
     c = np.array([shift, 0.5, 0.0])
-    assert float(segment_distances(a, b, c, c + [1.0, tilt, 0.0])) == pytest.approx(0.5, abs=1e-6)
+    assert float(segment_distances(a, b, c, c + np.array([1.0, tilt, 0.0]))) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_segment_distance_broadcasts():
@@ -79,7 +79,7 @@ def test_a_target_at_the_station_gives_numbers():
 
 def test_directions_are_scaled_and_checked():
     np.testing.assert_allclose(check_direction("up", [0, 3, 4]), [0, 0.6, 0.8])
-    with pytest.raises(InputError, match="up: .*not zero"):
+    with pytest.raises(InputError, match=r"up: .*not zero"):
         check_direction("up", [0, 0, 0])
     with pytest.raises(InputError, match="normal"):
         check_direction("normal", [[1, 0]], (None, 3))
