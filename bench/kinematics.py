@@ -76,8 +76,8 @@ def main() -> None:
         result.append({"batch": count, "ours_ns": 1e9 * mine, "pinocchio_ns": 1e9 * other, "ratio": other / mine})
     for row in result:
         print(
-            f"batch {row['batch']:>7}: {row['ours_ns']:7.1f} ns/pose, Pinocchio {row['pinocchio_ns']:7.1f} ns/pose, "
-            f"ratio {row['ratio']:.1f}",
+            f"batch {row['batch']:>7}: {row['ours_ns']:7.1f} ns/pose, Pinocchio {row['pinocchio_ns']:7.1f} "
+            f"ns/pose, ratio {row['ratio']:.1f}",
             file=sys.stderr,
         )
     print(json.dumps(result))

@@ -19,8 +19,9 @@ buffers that stay in the cache. Sines and cosines of all joints come from one ta
 
     t = tan(q/2),   d = 2/(1 + t²),   cos q = d − 1,   sin q = t·d,
 
-which NumPy vectorises where it does not vectorise sine and cosine. The program depends on the chain's *structure* (which amounts are zero or
-quarter turns), not on its numbers, so that one program serves a whole identification.
+which NumPy vectorises where it does not vectorise sine and cosine. The program depends on the chain's
+*structure* (which amounts are zero or quarter turns), not on its numbers, so that one program serves a whole
+identification.
 """
 
 from __future__ import annotations
