@@ -11,13 +11,12 @@
 The whole in one command, with a table and a picture at the end: python3 -m calib_planner.ros.demo
 """
 
+from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-
-from launch import LaunchDescription
 
 NAMES = {
     "planner": "calibration_planner",
