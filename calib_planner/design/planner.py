@@ -100,9 +100,7 @@ def plan(
 def worth_of(problem: PlanProblem, configurations: FloatArray) -> float:
     """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
     space = plan_space(problem)
-    matrix = space.model.at(configurations).sum(axis=0) + space.prior
-    hidden = covariance(matrix)[1]
-    worth = 0.0 if _blind(space, hidden) else space.criterion(problem.criterion).exact(_regular(matrix, hidden))
+    worth = _worth(space, space.criterion(problem.criterion), configurations)
     return reported_value(problem.criterion, worth, len(space.interest), problem.measurements)
 
 
@@ -224,8 +222,7 @@ def _good_enough(space: PlanSpace, relaxed: RelaxedDesign | None, best: SearchRe
     """Whether the best plan is so near its bound that more starts cannot pay."""
     if relaxed is None or best is None or space.problem.compound:
         return False
-    matrix = space.model.at(best.configurations).sum(axis=0) + space.prior
-    worth = space.criterion(space.problem.criterion).exact(matrix)
+    worth = _worth(space, space.criterion(space.problem.criterion), best.configurations)
     return worth >= (1.0 - GOOD_ENOUGH) * relaxed.bound
 
 
@@ -276,12 +273,9 @@ def _assemble(
     per = np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
     shares = problem.weight_array / max(problem.weight_array.sum(), 1e-300)
     accuracy = float(np.sqrt(shares @ per**2)) if len(per) else float("nan")
-    if _blind(space, hidden):
-        worth = 0.0
-    elif problem.criterion == "test_pose" and not problem.compound:
-        worth = accuracy**-2  # the figure reported, to the last digit
-    else:
-        worth = target.exact(_regular(matrix, hidden))
+    plain = problem.criterion == "test_pose" and not problem.compound
+    # For the paper's criterion the worth is that of the figure reported, to the last digit.
+    worth = accuracy**-2 if plain else _worth(space, target, configurations)
     proven = proof is not None and proof.holds
     bound = float("nan")
     if relaxed is not None:
@@ -354,6 +348,13 @@ def _efficiency(name: str, worth: float, bound: float, value: float, value_bound
     if name in POSE_CRITERIA:
         return value_bound / value if np.isfinite(value) else 0.0
     return efficiency(name, worth, bound)
+
+
+def _worth(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
+    """Ψ of a plan; 0 where it is blind to what the criterion needs."""
+    matrix = space.model.at(configurations).sum(axis=0) + space.prior
+    hidden = covariance(matrix)[1]
+    return 0.0 if _blind(space, hidden) else criterion.exact(_regular(matrix, hidden))
 
 
 def _blind(space: PlanSpace, hidden: FloatArray) -> bool:
