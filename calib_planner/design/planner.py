@@ -36,6 +36,9 @@ from calib_planner.design.space import PlanSpace, plan_space
 GOOD_ENOUGH = 0.012
 """Distance of a plan's worth from its bound, as a share, at which the search ends; half as much in ρ0."""
 
+AGREEMENT = 2e-4
+"""Difference of log worths below which two parts of the search have found the same plan."""
+
 __all__ = ["Progress", "plan", "worth_of"]
 
 
@@ -188,7 +191,7 @@ def _search(
     clock: _Clock,
     executor: Executor | None,
 ) -> SearchResult:
-    """All parts, here or by the executor, until one is good enough; the best of them, the first one if equal."""
+    """Parts of the work, here or by the executor, until enough is known; the best, the first one if equal."""
     nobody = np.empty((0, len(space.robot.joint_names)))
     search = SearchProblem(
         model=space.model,
@@ -203,11 +206,13 @@ def _search(
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
     best: SearchResult | None = None
     done = evaluations = 0
+    tops: list[float] = []
     futures = [executor.submit(search_chunk, *job) for job in work] if executor else []
     for index, job in enumerate(work):
-        if index and (clock.stop() or _good_enough(space, relaxed, best)):
+        if index and (clock.stop() or _agreed(tops) or _good_enough(space, relaxed, best)):
             break
         result = futures[index].result() if futures else search_chunk(*job, clock.stop)
+        tops.append(result.log_worth)
         done, evaluations = done + result.starts, evaluations + result.evaluations
         if best is None or result.log_worth > best.log_worth:
             best = result
@@ -216,6 +221,12 @@ def _search(
         future.cancel()
     assert best is not None
     return replace(best, starts=done, evaluations=evaluations)
+
+
+def _agreed(tops: list[float]) -> bool:
+    """Whether two parts with starts of their own ended at the same best value: more would hardly end above."""
+    best = sorted(tops)[-2:]
+    return len(best) == 2 and best[1] - best[0] < AGREEMENT
 
 
 def _good_enough(space: PlanSpace, relaxed: RelaxedDesign | None, best: SearchResult | None) -> bool:
