@@ -26,7 +26,8 @@ from calib_planner.robot.elements import Element, rotation
 from calib_planner.robot.linearisation import Layout, Linearisation
 from calib_planner.robot.parameters import Parameter, resolve_parameters
 from calib_planner.robot.posture import Posture
-from calib_planner.robot.program import Program, compile_program, structure_of
+from calib_planner.robot.program import Program, compile_program
+from calib_planner.robot.tracing import structure_of
 
 
 @dataclass(frozen=True, eq=False)
