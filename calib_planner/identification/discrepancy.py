@@ -31,8 +31,8 @@ NUGGETS = (0.1, 0.2, 0.4, 0.7, 1.0, 2.0, 5.0)
 SHORT_LEVER = 0.1
 """Joints whose lever on the targets is below this share of the longest are left out.
 
-Not a tuned optimum with a margin: on the one robot with re-seated targets that it was tried on, the held-out error
-with joint offsets is 0.47 mm at 0.1, 0.51 with every joint, 0.58 at 0.2, and 0.59 without the process.
+No optimum with a margin: on the one robot with re-seated targets that it was tried on, the held-out error with
+joint offsets is 0.47 mm at 0.1, 0.51 with every joint, 0.58 at 0.2, and 0.59 without the process.
 """
 
 
