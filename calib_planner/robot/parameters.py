@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 from calib_planner.errors import InputError, UnknownNameError
 
-LEVELS = ("offsets", "lengths", "lengths+offsets", "full")
 UNKNOWNS = ("base", "tool")
 BASE_PARAMETERS = ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz")
 
