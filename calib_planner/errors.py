@@ -84,3 +84,15 @@ class NotEnoughDataError(CalibPlannerError):
         self.have = have
         self.need = need
         super().__init__(message)
+
+
+class MissingExtraError(CalibPlannerError, ImportError):
+    """A package that only this feature needs is not installed.
+
+    Attributes:
+        extra: The extra of calib_planner that brings it.
+    """
+
+    def __init__(self, extra: str, package: str, feature: str) -> None:
+        self.extra = extra
+        super().__init__(f"{feature} needs {package}; install it with: pip install 'calib_planner[{extra}]'")

@@ -26,6 +26,7 @@ class _Stream:
     last_out: int | None = None
     behind: int = 0
     late: int = 0
+    dropped: int = 0
 
 
 @dataclass
@@ -55,12 +56,14 @@ class StampOrder(Generic[T]):
         if state.newest is not None and stamp < state.newest - self.window:
             state.behind += 1
             if state.behind < JUMP_AFTER:
+                state.dropped += 1
                 return False
             self._set_back(stream)
         state.behind = 0
         state.newest = stamp if state.newest is None else max(stamp, state.newest)
         if self._frontier is not None and stamp <= self._frontier:
             state.late += 1
+            state.dropped += 1
             return False
         state.late = 0
         self._count += 1
@@ -70,6 +73,10 @@ class StampOrder(Generic[T]):
     def late(self, stream: int) -> int:
         """Messages in a row that came too late because the stream lies behind the others."""
         return self._state[stream].late
+
+    def dropped(self, stream: int) -> int:
+        """Messages of the stream that were not passed on: too late, twice, or before a clock was set back."""
+        return self._state[stream].dropped
 
     def lag(self, stream: int) -> int:
         """How far the stream lies behind the most advanced one [ns]."""
@@ -91,6 +98,8 @@ class StampOrder(Generic[T]):
             if stamp != self._state[stream].last_out:
                 self._state[stream].last_out = stamp
                 out.append((stamp, stream, value))
+            else:
+                self._state[stream].dropped += 1
         return out
 
     def _advance(self) -> None:
@@ -104,7 +113,8 @@ class StampOrder(Generic[T]):
 
     def _set_back(self, stream: int) -> None:
         """Forget a stream's past: its clock was set back, or one stamp was far in the future."""
-        self._state[stream] = _Stream()
-        self._heap = [entry for entry in self._heap if entry[1] != stream]
+        kept = [entry for entry in self._heap if entry[1] != stream]
+        self._state[stream] = _Stream(dropped=self._state[stream].dropped + len(self._heap) - len(kept))
+        self._heap = kept
         heapq.heapify(self._heap)
         self._frontier = None

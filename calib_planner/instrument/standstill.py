@@ -214,6 +214,11 @@ class StandstillDetector:
         self._measured = None
         return results
 
+    @property
+    def dropped(self) -> tuple[int, ...]:
+        """Finite messages that took no part, joints first, then each target: too late, twice or set back."""
+        return tuple(self._order.dropped(k) for k in range(1 + self.target_count))
+
     # ── from messages to events in order ─────────────────────────────────────────────────────────────
 
     def _add(self, stream: int, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:

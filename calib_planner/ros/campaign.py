@@ -19,6 +19,7 @@ from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.solver import identify
 from calib_planner.instrument.standstill import Standstill
+from calib_planner.instrument.standstill_noise import mean_std
 from calib_planner.robot.chain import Robot
 
 
@@ -171,14 +172,9 @@ class Campaign:
             return None
         found = [d.found for d in self.accepted]
         points = np.array([f.points for f in found])
-        samples = np.array([f.samples for f in found])
-        sigma = how.sigma or _scatter(found)
-        with np.errstate(divide="ignore"):
-            std = np.sqrt(sigma**2 / samples + how.repeatability**2)
-        std = np.repeat(np.where(samples > 0, std, np.nan)[:, :, None], 3, axis=2)
-        known = bool((std[samples > 0] > 0).all())
+        std = mean_std(found, how.sigma, how.repeatability)
         q = np.array([f.joints for f in found])
-        return Measurements(self.robot.joint_names, q, points, std if known else None)
+        return Measurements(self.robot.joint_names, q, points, std)
 
     def estimate(self, how: Matching) -> Estimate | TooFew:
         """Identify with what there is."""
@@ -192,11 +188,3 @@ class Campaign:
             each = 3 * len(self.robot.targets)
             missing = max(-(-(error.need - error.have) // each), 1)
             return TooFew(missing, f"{missing} more configurations needed at least: {error}")
-
-
-def _scatter(found: list[Standstill]) -> float:
-    """Standard deviation of one coordinate of one sample [m], pooled; NaN free, 0 if unknown."""
-    freedom = np.array([np.maximum(f.samples - 1, 0) for f in found])
-    variance = np.array([f.std**2 * f.samples for f in found])
-    total = float(freedom.sum())
-    return float(np.sqrt(np.nansum(freedom * variance) / total)) if total else 0.0

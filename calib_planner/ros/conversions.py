@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from calib_planner._arrays import FloatArray, check_array, check_number, frozen
+from calib_planner._arrays import FloatArray, check_array, check_number
 from calib_planner.design.plan import Plan
-from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.errors import InputError
+from calib_planner.instrument.joint_state import pick_joints
 from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
 from calib_planner.ros.motion import PEAK
 
@@ -204,19 +205,7 @@ def joints_from_message(message: JointState, joint_names: Sequence[str]) -> Floa
         UnknownNameError: A joint is missing.
         InputError: A name is there twice, or names and positions differ in number.
     """
-    names = list(message.name)
-    if len(names) != len(message.position):
-        got = f"{len(message.position)} positions for {len(names)} names"
-        raise InputError("position", got, "one position per name")
-    where = {name: i for i, name in enumerate(names)}
-    for name in joint_names:
-        if name not in where:
-            raise UnknownNameError("name", name, names[:50])
-    if len(where) != len(names):
-        doubled = sorted({n for n in joint_names if names.count(n) > 1})
-        if doubled:
-            raise InputError("name", f"{', '.join(doubled)} more than once", "each joint once")
-    return frozen(np.array([message.position[where[name]] for name in joint_names], dtype=float))
+    return pick_joints(message.name, message.position, joint_names)
 
 
 def joints_message(names: Sequence[str], positions: FloatArray, stamp: int) -> JointState:

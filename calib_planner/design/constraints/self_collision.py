@@ -15,20 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_planner._arrays import FloatArray
-from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
+from calib_planner.errors import FileFormatError, InputError, MissingExtraError
 from calib_planner.robot.chain import Robot
-
-
-class MissingExtraError(CalibPlannerError, ImportError):
-    """A package that only this feature needs is not installed.
-
-    Attributes:
-        extra: The extra of calib_planner that brings it.
-    """
-
-    def __init__(self, extra: str, package: str, feature: str) -> None:
-        self.extra = extra
-        super().__init__(f"{feature} needs {package}; install it with: pip install 'calib_planner[{extra}]'")
 
 
 @dataclass(frozen=True, eq=False)
