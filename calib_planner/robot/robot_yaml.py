@@ -1,4 +1,4 @@
-"""Robots as YAML: the chain of eq. (2) written down element by element.
+"""Robots as YAML: the chain of eq. (2) element by element, or a Denavit–Hartenberg table.
 
     name: planar_2r
     joints:                       # order of all joint arrays
@@ -10,28 +10,47 @@
     base: {xyz: [0, 0, 0], rpy: [0, 0, 0]}    # optional [m, rad]
     lengths: [l1]                 # the parameters of the level "lengths"
     offsets: [dq1]                # the parameters of the level "offsets"
+    levels: {elbow: [l1, dq2]}    # optional, further levels
 
-Six placement errors ``<joint>.x … <joint>.rz`` in front of every joint are added here; they make up the level
-``full``.
+In place of ``elements``, a table, standard (``dh``) or modified (``modified_dh``), as in ``dh.py``:
+
+    dh:
+      length_unit: mm             # of a and d: m (default) or mm
+      angle_unit: deg             # of alpha and theta: rad (default) or deg
+      rows:                       # what is not given is 0; type: revolute (default), prismatic or fixed
+        - {joint: q1, theta: 0, d: 0, a: 1000, alpha: 0}
+        - {joint: q2, type: prismatic, sign: -1, alpha: 90}
+
+A table brings its own ``lengths`` and ``offsets``, unless they are given, and the level ``dh``. Six placement
+errors ``<joint>.x … <joint>.rz`` in front of every joint are added to either; they make up the level ``full``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from calib_planner._arrays import FloatArray
 from calib_planner.errors import CalibPlannerError, FileFormatError
 from calib_planner.robot.chain import Robot, target_elements
-from calib_planner.robot.elements import Element, pose_elements
+from calib_planner.robot.dh import ROW_TYPES, DhRow, dh_elements, dh_levels
+from calib_planner.robot.elements import KINDS, Element, pose_elements
+from calib_planner.robot.joint_names import check_joint_names
+from calib_planner.robot.yaml_reader import YamlReader, brief
 
-KEYS = ("name", "description", "joints", "elements", "targets", "base", "lengths", "offsets")
+CHAINS = ("elements", "dh", "modified_dh")
+KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", "lengths", "offsets", "levels")
 ELEMENT_KEYS = ("type", "value", "joint", "sign", "parameter")
+TABLE_KEYS = ("rows", "length_unit", "angle_unit")
+ROW_KEYS = ("joint", "type", "theta", "d", "a", "alpha", "sign")
 JOINT_KEYS = ("name", "lower", "upper", "unit")
-UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
+ANGLES = {"rad": 1.0, "deg": np.pi / 180.0}
+LENGTHS = {"m": 1.0, "mm": 1e-3}
+PLACEMENT_ERRORS = ("x", "y", "z", "rx", "ry", "rz")
+Levels = Mapping[str, tuple[str, ...]]
 
 
 def read_robot_yaml(path: Path) -> Robot:
@@ -40,136 +59,150 @@ def read_robot_yaml(path: Path) -> Robot:
     Raises:
         FileFormatError: Names the key at fault, what it holds and what is valid.
     """
+    reader = _Reader(path)
+    document = reader.document()
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileFormatError(path, "file", str(error).replace("\n", " "), "readable YAML") from None
-    return _Reader(path).robot(document)
+        return reader.robot(document)
+    except FileFormatError:
+        raise
+    except CalibPlannerError as error:
+        raise reader.error("robot", error, "a consistent chain") from None
 
 
-class _Reader:
-    """Reads one document; holds the path for the errors, nothing else."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
+class _Reader(YamlReader):
+    """Reads one document."""
 
     def robot(self, document: Any) -> Robot:
-        top = self.mapping("document", document, KEYS, required=("joints", "elements"))
+        top = self.mapping("document", document, KEYS, required=("joints",))
         joints = [
             self.mapping(f"joints[{i}]", j, JOINT_KEYS, required=("name", "lower", "upper"))
             for i, j in enumerate(self.sequence("joints", top["joints"]))
         ]
-        names = tuple(str(j["name"]) for j in joints)
-        limits = np.array([self.limits(f"joints[{i}]", j) for i, j in enumerate(joints)])
-        base = self.mapping("base", top.get("base", {}), ("xyz", "rpy"))
-        chain = [
-            *pose_elements(
-                "base",
-                self.vector("base.xyz", base.get("xyz", [0, 0, 0])),
-                self.vector("base.rpy", base.get("rpy", [0, 0, 0])),
-            )
-        ]
-        full: list[str] = []
-        for i, item in enumerate(self.sequence("elements", top["elements"])):
-            element = self.element(f"elements[{i}]", item, names)
-            if element.joint is not None:
-                errors = _placement_errors(names[element.joint])
-                full += [str(e.parameter) for e in errors]
-                chain += errors
-            chain.append(element)
-        targets = [
-            self.vector(f"targets[{i}]", t)
-            for i, t in enumerate(self.sequence("targets", top.get("targets", [[0, 0, 0]])))
-        ]
-        known = {e.parameter for e in chain}
-        lengths = self.names("lengths", top.get("lengths", []), known)
-        offsets = self.names("offsets", top.get("offsets", []), known)
-        levels = {
-            "offsets": offsets,
-            "lengths": lengths,
-            "lengths+offsets": lengths + offsets,
-            "full": tuple(full),
-        }
-        try:
-            return Robot(
-                name=str(top.get("name", self.path.stem)),
-                elements=tuple(chain),
-                targets=target_elements(np.array(targets)),
-                joint_names=names,
-                joint_limits=limits,
-                levels={k: v for k, v in levels.items() if v},
-                parameter_names=lengths + offsets or tuple(full),
-                source=str(self.path),
-            )
-        except FileFormatError:
-            raise
-        except CalibPlannerError as error:
-            raise FileFormatError(self.path, "robot", error, "a consistent chain") from None
+        names = tuple(self.text(f"joints[{i}].name", j["name"]) for i, j in enumerate(joints))
+        check_joint_names(self.path, names)
+        chain, levels = self.chain(top, names)
+        chain = [*self.base(top.get("base", {})), *_with_placement_errors(chain, names)]
+        full = tuple(f"{names[e.joint]}.{x}" for e in chain if e.joint is not None for x in PLACEMENT_ERRORS)
+        levels = self.levels(top, {**levels, "full": full}, [e.parameter for e in chain if e.parameter])
+        robot = Robot(
+            name=self.text("name", top.get("name", self.path.stem)),
+            elements=tuple(chain),
+            targets=target_elements(self.targets(top.get("targets", [[0, 0, 0]]))),
+            joint_names=names,
+            joint_limits=np.array([self.limits(f"joints[{i}]", j) for i, j in enumerate(joints)]),
+            levels=levels,
+            parameter_names=levels.get("lengths+offsets", levels["full"]),
+            source=str(self.path),
+        )
+        self.check_units(robot, joints)
+        return robot
 
-    def element(self, where: str, item: Any, joint_names: tuple[str, ...]) -> Element:
+    def chain(self, top: Mapping[str, Any], names: Sequence[str]) -> tuple[list[Element], Levels]:
+        """The chain and the levels that it brings."""
+        given = [key for key in CHAINS if key in top]
+        if len(given) != 1:
+            raise self.error(
+                "document", " and ".join(given) or "no chain", f"exactly one of: {', '.join(CHAINS)}"
+            )
+        if given != ["elements"]:
+            return self.table(given[0], top[given[0]], names)
+        items = enumerate(self.sequence("elements", top["elements"]))
+        return [self.element(f"elements[{i}]", item, names) for i, item in items], {}
+
+    def element(self, where: str, item: Any, joint_names: Sequence[str]) -> Element:
         entry = self.mapping(where, item, ELEMENT_KEYS, required=("type",))
-        joint = entry.get("joint")
-        if joint is not None and joint not in joint_names:
-            raise FileFormatError(self.path, f"{where}.joint", repr(joint), f"one of: {', '.join(joint_names)}")
-        parameter = entry.get("parameter")
-        try:
-            return Element(
-                kind=str(entry["type"]),
-                value=self.number(f"{where}.value", entry.get("value", 0.0)),
-                joint=None if joint is None else joint_names.index(joint),
-                sign=self.number(f"{where}.sign", entry.get("sign", 1)),
-                parameter=None if parameter is None else str(parameter),
-            )
-        except FileFormatError:
-            raise
-        except CalibPlannerError as error:
-            raise FileFormatError(self.path, where, item, str(error)) from None
-
-    def limits(self, where: str, joint: Mapping[str, Any]) -> tuple[float, float]:
-        unit = str(joint.get("unit", "rad"))
-        if unit not in UNITS:
-            raise FileFormatError(self.path, f"{where}.unit", unit, f"one of: {', '.join(UNITS)}")
-        return tuple(  # type: ignore[return-value]
-            UNITS[unit] * self.number(f"{where}.{key}", joint[key]) for key in ("lower", "upper")
+        names = {
+            key: None if entry.get(key) is None else self.text(f"{where}.{key}", entry[key])
+            for key in ("joint", "parameter")
+        }
+        joint = names["joint"]
+        return Element(
+            kind=self.choice(f"{where}.type", entry["type"], KINDS),
+            value=self.number(f"{where}.value", entry.get("value", 0.0)),
+            joint=None if joint is None else joint_names.index(self.choice(f"{where}.joint", joint, joint_names)),
+            sign=self.sign(f"{where}.sign", entry.get("sign", 1)),
+            parameter=names["parameter"],
         )
 
-    def mapping(
-        self, where: str, item: Any, keys: tuple[str, ...], required: tuple[str, ...] = ()
-    ) -> dict[str, Any]:
-        if not isinstance(item, Mapping):
-            raise FileFormatError(self.path, where, type(item).__name__, f"a mapping with keys {', '.join(keys)}")
-        for key in item:
-            if key not in keys:
-                raise FileFormatError(self.path, where, f"unknown key {key!r}", f"only: {', '.join(keys)}")
-        for key in required:
-            if key not in item:
-                raise FileFormatError(self.path, where, f"no key {key!r}", f"{key!r} to be given")
-        return dict(item)
+    def table(self, key: str, item: Any, names: Sequence[str]) -> tuple[list[Element], Levels]:
+        """A Denavit–Hartenberg table."""
+        table = self.mapping(key, item, TABLE_KEYS, required=("rows",))
+        length = LENGTHS[self.choice(f"{key}.length_unit", table.get("length_unit", "m"), LENGTHS)]
+        angle = ANGLES[self.choice(f"{key}.angle_unit", table.get("angle_unit", "rad"), ANGLES)]
+        scales = {"theta": angle, "d": length, "a": length, "alpha": angle}
+        items = enumerate(self.sequence(f"{key}.rows", table["rows"]))
+        rows = [self.row(f"{key}.rows[{i}]", entry, names, scales) for i, entry in items]
+        check_joint_names(self.path, [row.joint for row in rows])
+        for name in set(names).difference(row.joint for row in rows):
+            raise self.error(f"{key}.rows", f"no row of joint {name!r}", "one row for every joint")
+        modified = key == "modified_dh"
+        return list(dh_elements(rows, names, modified=modified)), dh_levels(rows, modified=modified)
 
-    def sequence(self, where: str, item: Any) -> list[Any]:
-        if not isinstance(item, list) or not item:
-            raise FileFormatError(self.path, where, repr(item)[:80], "a list with at least one entry")
-        return item
+    def row(self, where: str, item: Any, names: Sequence[str], scales: Mapping[str, float]) -> DhRow:
+        entry = self.mapping(where, item, ROW_KEYS, required=("joint",))
+        joint = self.text(f"{where}.joint", entry["joint"])
+        kind = self.choice(f"{where}.type", entry.get("type", "revolute"), ROW_TYPES)
+        if kind == "fixed" and (joint in names or "sign" in entry):
+            raise self.error(where, f"a sign or the joint {joint!r}", "neither, in a row whose type is fixed")
+        if kind != "fixed":
+            self.choice(f"{where}.joint", joint, names)
+        numbers = {k: s * self.number(f"{where}.{k}", entry[k]) for k, s in scales.items() if k in entry}
+        return DhRow(joint, kind, sign=self.sign(f"{where}.sign", entry.get("sign", 1)), **numbers)
 
-    def number(self, where: str, item: Any) -> float:
-        if isinstance(item, bool) or not isinstance(item, (int, float)) or not np.isfinite(item):
-            raise FileFormatError(self.path, where, repr(item)[:80], "a finite number")
-        return float(item)
+    def sign(self, where: str, item: Any) -> float:
+        sign = self.number(where, item)
+        if abs(sign) != 1.0:
+            raise self.error(where, brief(item), "+1 or -1")
+        return sign
 
-    def vector(self, where: str, item: Any) -> np.ndarray:
-        if not isinstance(item, list) or len(item) != 3:
-            raise FileFormatError(self.path, where, repr(item)[:80], "three numbers")
-        return np.array([self.number(f"{where}[{i}]", v) for i, v in enumerate(item)])
+    def levels(self, top: Mapping[str, Any], own: Levels, known: Sequence[str]) -> Levels:
+        """All levels that are not empty; ``own`` are the chain's."""
+        found = dict(own)
+        for key in ("lengths", "offsets"):
+            found[key] = self.names(key, top[key], known) if key in top else own.get(key, ())
+        found["lengths+offsets"] = (*found["lengths"], *found["offsets"])
+        further = top.get("levels", {})
+        for key in self.mapping("levels", further, tuple(further) if isinstance(further, Mapping) else ()):
+            name = self.text("levels", key)
+            if name in found or name in known or "," in name:
+                raise self.error(
+                    "levels", repr(name), "a name that no other level or parameter has, without commas"
+                )
+            found[name] = self.names(f"levels.{name}", further[key], known)
+        return {key: tuple(names) for key, names in found.items() if names}
 
-    def names(self, where: str, item: Any, known: set[str | None]) -> tuple[str, ...]:
-        if not isinstance(item, list):
-            raise FileFormatError(self.path, where, repr(item)[:80], "a list of parameter names")
-        for name in item:
-            if name not in known:
-                valid = ", ".join(sorted(n for n in known if n))
-                raise FileFormatError(self.path, where, repr(name), f"only: {valid}")
-        return tuple(str(n) for n in item)
+    def base(self, item: Any) -> tuple[Element, ...]:
+        base = self.mapping("base", item, ("xyz", "rpy"))
+        xyz, rpy = (self.vector(f"base.{k}", base.get(k, [0, 0, 0])) for k in ("xyz", "rpy"))
+        return pose_elements("base", xyz, rpy)
+
+    def targets(self, item: Any) -> FloatArray:
+        return np.array([self.vector(f"targets[{i}]", t) for i, t in enumerate(self.sequence("targets", item))])
+
+    def limits(self, where: str, joint: Mapping[str, Any]) -> tuple[float, float]:
+        scales = ANGLES | LENGTHS
+        scale = scales[self.choice(f"{where}.unit", joint.get("unit", "rad"), scales)]
+        lower, upper = (scale * self.number(f"{where}.{key}", joint[key]) for key in ("lower", "upper"))
+        return lower, upper
+
+    def check_units(self, robot: Robot, joints: Sequence[Mapping[str, Any]]) -> None:
+        """A unit that is given must be one of the joint's kind."""
+        for i, (joint, turns) in enumerate(zip(joints, robot.joint_is_revolute, strict=True)):
+            valid = ANGLES if turns else LENGTHS
+            if joint.get("unit", next(iter(valid))) not in valid:
+                kind = "turns" if turns else "slides"
+                expected = f"one of: {', '.join(valid)}, as the joint {kind}"
+                raise self.error(f"joints[{i}].unit", repr(joint["unit"]), expected)
 
 
-def _placement_errors(joint: str) -> list[Element]:
-    return [Element(k + a, parameter=f"{joint}.{'r' * (k == 'R')}{a}") for k in "TR" for a in "xyz"]
+def _with_placement_errors(chain: Sequence[Element], joint_names: Sequence[str]) -> list[Element]:
+    """The chain with six placement errors in front of every joint."""
+    found: list[Element] = []
+    for element in chain:
+        if element.joint is not None:
+            name = joint_names[element.joint]
+            found += [
+                Element(kind, parameter=f"{name}.{x}") for kind, x in zip(KINDS, PLACEMENT_ERRORS, strict=True)
+            ]
+        found.append(element)
+    return found
