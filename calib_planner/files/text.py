@@ -22,6 +22,15 @@ def read_text(path: str | Path, what: str) -> str:
     Raises:
         FileFormatError: No such file, not readable, too big or not UTF-8.
     """
+    return decode(path, what, read_bytes(path, what), "utf-8-sig")
+
+
+def read_bytes(path: str | Path, what: str) -> bytes:
+    """Like ``read_text``, the bytes as they are.
+
+    Raises:
+        FileFormatError: No such file, not readable or too big.
+    """
     try:
         with open(Path(path).expanduser(), "rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -31,8 +40,17 @@ def read_text(path: str | Path, what: str) -> str:
     if len(data) > MAX_BYTES:
         limit = f"{what} of at most {MAX_BYTES // 1_000_000} MB"
         raise FileFormatError(path, "file", "a larger file", limit, "split it")
+    return data
+
+
+def decode(path: str | Path, what: str, data: bytes, encoding: str = "utf-8") -> str:
+    """``data`` as text; ``encoding`` utf-8-sig drops a byte order mark.
+
+    Raises:
+        FileFormatError: Not UTF-8.
+    """
     try:
-        return data.decode("utf-8-sig")
+        return data.decode(encoding)
     except UnicodeDecodeError as error:
         advice = "save it as UTF-8 text"
         raise FileFormatError(path, "file", f"{error.reason}", f"{what}", advice) from None

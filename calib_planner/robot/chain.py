@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_planner._arrays import FloatArray, check_array, check_configurations, frozen
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.elements import Element, rotation
+from calib_planner.robot.elements import Element, roll_pitch_yaw, rotation
 from calib_planner.robot.linearisation import Layout, Linearisation
 from calib_planner.robot.parameters import Parameter, resolve_parameters
 from calib_planner.robot.posture import Posture
@@ -111,11 +111,7 @@ class Robot:
         """The robot placed at ``xyz`` [m] with axes ``rotation_matrix`` (3, 3), e.g. in a tracker's frame."""
         matrix = check_array("rotation_matrix", rotation_matrix, (3, 3))
         offset = check_array("xyz", xyz, (3,))
-        yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
-        pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-        # The rest about x, taken from what yaw and pitch leave: exact also where pitch is ±90°.
-        rest = rotation(1, pitch).T @ rotation(2, yaw).T @ matrix
-        roll = np.arctan2(rest[2, 1], rest[1, 1])
+        roll, pitch, yaw = roll_pitch_yaw(matrix)
         values = [*offset, yaw, pitch, roll, 0.0, 0.0, 0.0]
         head = tuple(replace(e, value=float(v)) for e, v in zip(self.elements[:9], values, strict=True))
         return replace(self, elements=head + self.elements[9:])

@@ -72,6 +72,15 @@ def rotation(axis: int, angle: float) -> FloatArray:
     return matrix
 
 
+def roll_pitch_yaw(matrix: FloatArray) -> FloatArray:
+    """(3,) angles [rad] with ``Rz(yaw) Ry(pitch) Rx(roll) = matrix`` (3, 3), exact also at pitch ±90°."""
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
+    # The rest about x, taken from what yaw and pitch leave: they need not be well determined themselves.
+    rest = rotation(1, pitch).T @ rotation(2, yaw).T @ matrix
+    return np.array([np.arctan2(rest[2, 1], rest[1, 1]), pitch, yaw])
+
+
 def pose_elements(prefix: str, xyz: FloatArray, rpy: FloatArray) -> tuple[Element, ...]:
     """A constant pose with its six placement errors ``prefix.x … prefix.rz``.
 
