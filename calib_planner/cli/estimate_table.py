@@ -6,8 +6,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.cli.plan_table import length
 from calib_planner.identification.estimate import Estimate
+from calib_planner.report.quantities import length
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 

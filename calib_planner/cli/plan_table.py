@@ -9,6 +9,7 @@ from rich.table import Table
 from calib_planner.design.budget import Split
 from calib_planner.design.plan import Plan
 from calib_planner.design.problem import POSE_CRITERIA
+from calib_planner.report.quantities import length
 from calib_planner.robot.chain import Robot
 
 
@@ -63,15 +64,6 @@ def show_tried(split: Split, console: Console) -> None:
     console.print(table)
     if split.fewest:
         console.print(f"No plan of fewer than {split.fewest} measurements can reach it.")
-
-
-def length(metres: float) -> str:
-    """A length with a unit that suits it."""
-    if not np.isfinite(metres):
-        return "unlimited"
-    if abs(metres) < 1e-3:
-        return f"{1e6 * metres:.3g} µm"
-    return f"{1e3 * metres:.4g} mm"
 
 
 def _configurations(plan: Plan, robot: Robot) -> Table:
