@@ -87,12 +87,14 @@ def _show(robot: Robot, console: Console) -> None:
         shown = np.degrees(limits) if turns else 1e3 * limits
         joints.add_row(name, "°" if turns else "mm", *(f"{v:.2f}" for v in shown))
     console.print(joints)
-    parameters = Table("parameter", "unit", "levels", title="parameters of --parameters lengths+offsets")
+    parameters = Table("parameter", "unit", "levels", title="parameters unless --parameters says otherwise")
     parameters.add_column("nominal", justify="right")
     for p in robot.parameters:
         levels = [k for k, names in robot.levels.items() if p.name in names]
         unit = "mm" if p.unit == "m" else "mrad"
         parameters.add_row(p.name, unit, ", ".join(levels), f"{1e3 * p.nominal:.4f}")
     console.print(parameters)
+    levels = [f"{k} ({len(names)})" for k, names in robot.levels.items() if names]
+    console.print(f"Levels for --parameters: {', '.join(levels)}")
     more = [n for n in robot.available_parameters if n not in robot.parameter_names]
     console.print(f"Further parameters: {', '.join(more)}")

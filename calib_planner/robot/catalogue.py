@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from calib_planner.errors import UnknownNameError
+from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.robot_yaml import read_robot_yaml
 from calib_planner.robot.urdf import read_urdf
 
-URDF_SUFFIXES = (".urdf", ".xml")
+URDF_SUFFIXES = (".urdf", ".xml", ".xacro", ".sdf")
+"""Files that are read as URDF; what is another format after all is told so by its content."""
 YAML_SUFFIXES = (".yaml", ".yml")
 
 
@@ -30,12 +31,18 @@ def shipped_robots() -> Sequence[str]:
 
 def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
     """See ``Robot.load``."""
-    if str(source) in shipped_robots():
-        return read_robot_yaml(config_folder() / "robots" / f"{source}.yaml")
     path = Path(source).expanduser()
-    if path.is_file():
-        if path.suffix.lower() in YAML_SUFFIXES:
-            return read_robot_yaml(path)
-        if path.suffix.lower() in URDF_SUFFIXES:
-            return read_urdf(path, base_link, tip_link)
-    raise UnknownNameError("robot", str(source), [*shipped_robots(), "PATH.urdf", "PATH.yaml (an existing file)"])
+    if str(source) in shipped_robots():
+        path = config_folder() / "robots" / f"{source}.yaml"
+    suffix = path.suffix.lower()
+    if not path.is_file() or suffix not in (*YAML_SUFFIXES, *URDF_SUFFIXES):
+        raise UnknownNameError(
+            "robot", str(source), [*shipped_robots(), "PATH.urdf", "PATH.yaml (an existing file)"]
+        )
+    if suffix in URDF_SUFFIXES:
+        return read_urdf(path, base_link, tip_link)
+    for field, link in (("base_link", base_link), ("tip_link", tip_link)):
+        if link is not None:
+            advice = f"leave it out: {path.name} is one chain"
+            raise InputError(field, repr(link), "no link beside a robot YAML, only beside a URDF", advice)
+    return read_robot_yaml(path)

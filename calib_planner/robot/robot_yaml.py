@@ -91,7 +91,7 @@ class _Reader(YamlReader):
             joint_names=names,
             joint_limits=np.array([self.limits(f"joints[{i}]", j) for i, j in enumerate(joints)]),
             levels=levels,
-            parameter_names=levels.get("lengths+offsets", levels["full"]),
+            parameter_names=levels.get("lengths+offsets") or full,
             source=str(self.path),
         )
         self.check_units(robot, joints)

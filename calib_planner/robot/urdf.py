@@ -5,8 +5,8 @@ one rotation or translation about its axis with the offset parameter ``<joint>.o
 ±x, ±y, ±z are reached by two constant rotations and left by their inverse.
 
 Only kinematics is read, with the standard library's parser; a document type declaration is refused, so no
-entity is ever expanded. Fixed joints keep their place in the chain, as constants. Mimic joints in the chain
-are refused: their coordinate is not a measured one.
+entity is ever expanded. Fixed joints keep their place in the chain, as constants. Which joints make the chain,
+and what is refused in it (mimic, floating and planar joints), is in ``urdf_tree``.
 """
 
 from __future__ import annotations
@@ -21,27 +21,26 @@ from calib_planner._arrays import FloatArray
 from calib_planner.errors import CalibPlannerError, FileFormatError
 from calib_planner.robot.chain import Robot, target_elements
 from calib_planner.robot.elements import Element, pose_elements
+from calib_planner.robot.joint_names import check_joint_names
+from calib_planner.robot.urdf_tree import MOVING, TreeJoint, read_chain
 
-MOVING = ("revolute", "continuous", "prismatic")
+MODEL_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """One ``<joint>``: name, type, parent and child link, origin, axis, limits ([rad] or [m])."""
+    """One ``<joint>`` of the chain: name, type, origin, unit axis, limits ([rad] or [m])."""
 
     name: str
     type: str
-    parent: str
-    child: str
     xyz: FloatArray
     rpy: FloatArray
     axis: FloatArray
     limits: tuple[float, float]
-    mimic: bool
 
 
 def read_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Robot:
-    """Read the chain from ``base_link`` (default: the root) to ``tip_link`` (default: the only leaf)."""
+    """Read the chain from ``base_link`` (default: the root) to ``tip_link`` (default: the only tip)."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -60,41 +59,40 @@ def parse_urdf(text: str, source: str, base_link: str | None = None, tip_link: s
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
+        if "<xacro:" in text:
+            raise _xacro(source) from None
         raise FileFormatError(source, "XML", error, "well-formed XML") from None
     if root.tag != "robot":
-        raise FileFormatError(source, "root element", f"<{root.tag}>", "<robot>")
-    joints = [_joint(source, item) for item in root.findall("joint")]
-    links = [str(item.get("name")) for item in root.findall("link")]
-    chain = _chain(source, joints, links, base_link, tip_link)
-    return _robot(source, str(root.get("name", "robot")), chain)
+        got = MODEL_FORMATS.get(root.tag, f"<{root.tag}>")
+        advice = "export the robot as URDF" if root.tag in MODEL_FORMATS else ""
+        raise FileFormatError(source, "root element", got, "<robot>, a URDF", advice)
+    if any("xacro" in item.tag or "${" in "".join(item.attrib.values()) for item in root.iter()):
+        raise _xacro(source)
+    joints = [_joint(source, joint) for joint in read_chain(source, root, base_link, tip_link)]
+    return _robot(source, str(root.get("name", "robot")), joints)
 
 
-def _joint(source: str, item: ElementTree.Element) -> UrdfJoint:
-    name = item.get("name", "")
-    where = f"joint {name!r}"
-    kind = item.get("type", "")
-    parent, child = item.find("parent"), item.find("child")
-    if not name or parent is None or child is None:
-        raise FileFormatError(source, where, "no name, parent or child", "all three")
-    if kind not in (*MOVING, "fixed", "floating", "planar"):
-        raise FileFormatError(source, f"{where} type", repr(kind), f"{', '.join(MOVING)} or fixed")
-    origin, axis, limit = item.find("origin"), item.find("axis"), item.find("limit")
-    zero = "0 0 0"
-    direction = _vector(source, f"{where} axis", "1 0 0" if axis is None else axis.get("xyz", ""))
-    length = float(np.linalg.norm(direction))
-    if length == 0 and kind in MOVING:
-        raise FileFormatError(source, f"{where} axis", "0 0 0", "a direction")
-    return UrdfJoint(
-        name=name,
-        type=kind,
-        parent=parent.get("link", ""),
-        child=child.get("link", ""),
-        xyz=_vector(source, f"{where} origin xyz", zero if origin is None else origin.get("xyz", zero)),
-        rpy=_vector(source, f"{where} origin rpy", zero if origin is None else origin.get("rpy", zero)),
-        axis=direction / (length or 1.0),
-        limits=_limits(source, where, kind, limit),
-        mimic=item.find("mimic") is not None,
+def _xacro(source: str) -> FileFormatError:
+    advice = "expand it first: xacro FILE.urdf.xacro > robot.urdf"
+    return FileFormatError(source, "document", "a xacro file", "plain URDF", advice)
+
+
+def _joint(source: str, joint: TreeJoint) -> UrdfJoint:
+    where = f"joint {joint.name!r}"
+    origin, axis, limit = (joint.item.find(tag) for tag in ("origin", "axis", "limit"))
+    xyz, rpy = (
+        _vector(source, f"{where} origin {key}", "0 0 0" if origin is None else origin.get(key, "0 0 0"))
+        for key in ("xyz", "rpy")
     )
+    direction = np.array([1.0, 0.0, 0.0])
+    if axis is not None and joint.type in MOVING:
+        direction = _vector(source, f"{where} axis", axis.get("xyz", "1 0 0"))
+    size = float(np.abs(direction).max())
+    if size == 0:
+        raise FileFormatError(source, f"{where} axis", "0 0 0", "a direction")
+    direction = direction / size  # first, so that squares of tiny or huge numbers neither vanish nor overflow
+    direction = direction / np.linalg.norm(direction)
+    return UrdfJoint(joint.name, joint.type, xyz, rpy, direction, _limits(source, where, joint.type, limit))
 
 
 def _limits(source: str, where: str, kind: str, limit: ElementTree.Element | None) -> tuple[float, float]:
@@ -106,7 +104,8 @@ def _limits(source: str, where: str, kind: str, limit: ElementTree.Element | Non
         return 0.0, 0.0
     low, high = (_floats(source, f"{where} limit", limit.get(k, "0"), 1)[0] for k in ("lower", "upper"))
     if not low < high:
-        raise FileFormatError(source, f"{where} limit", f"[{low}, {high}]", "lower < upper")
+        advice = "give the range that may be used, or make the joint fixed"
+        raise FileFormatError(source, f"{where} limit", f"[{low}, {high}]", "lower < upper", advice)
     return low, high
 
 
@@ -124,58 +123,11 @@ def _vector(source: str, where: str, text: str) -> FloatArray:
     return np.array(_floats(source, where, text, 3))
 
 
-def _chain(
-    source: str,
-    joints: list[UrdfJoint],
-    links: list[str],
-    base_link: str | None,
-    tip_link: str | None,
-) -> list[UrdfJoint]:
-    """The joints from base to tip, found by climbing from the tip."""
-    by_child = {j.child: j for j in joints}
-    parents = {j.parent for j in joints}
-    for label, link in (("base link", base_link), ("tip link", tip_link)):
-        if link is not None and link not in links:
-            raise FileFormatError(source, label, repr(link), f"one of: {', '.join(links)}")
-    if tip_link is None:
-        leaves = [link for link in links if link not in parents and link in by_child]
-        if len(leaves) != 1:
-            raise FileFormatError(
-                source,
-                "tip link",
-                f"{len(leaves)} possible tips: {', '.join(leaves)}",
-                "one",
-                "name it",
-            )
-        tip_link = leaves[0]
-    chain: list[UrdfJoint] = []
-    link = tip_link
-    while link != base_link and link in by_child:
-        if len(chain) > len(joints):
-            raise FileFormatError(source, "joints", "a loop", "a tree of links")
-        joint = by_child[link]
-        if joint.type in ("floating", "planar") or joint.mimic:
-            kind = "mimic" if joint.mimic else joint.type
-            raise FileFormatError(
-                source,
-                f"joint {joint.name!r}",
-                f"a {kind} joint in the chain",
-                f"{', '.join(MOVING)} or fixed",
-                "choose base and tip links that avoid it",
-            )
-        chain.append(joint)
-        link = joint.parent
-    if base_link is not None and link != base_link:
-        raise FileFormatError(source, "base link", repr(base_link), f"a link above {tip_link!r}")
-    if not any(j.type in MOVING for j in chain):
-        raise FileFormatError(source, "chain", "no moving joint", "at least one")
-    return chain[::-1]
-
-
 def _robot(source: str, name: str, chain: list[UrdfJoint]) -> Robot:
     zero = np.zeros(3)
     elements = [*pose_elements("base", zero, zero)]
     moving = [j for j in chain if j.type in MOVING]
+    check_joint_names(source, [j.name for j in moving])
     lengths: list[str] = []
     full: list[str] = []
     for joint in chain:
