@@ -69,6 +69,8 @@ def _by_child(source: str, root: ElementTree.Element, links: list[str]) -> dict[
             both = f"joints {by_child[joint.child].name!r} and {joint.name!r} above it"
             raise FileFormatError(source, f"link {joint.child!r}", both, "one joint above each link: a tree")
         by_child[joint.child] = joint
+    if by_child and len(by_child) == len(links):
+        raise FileFormatError(source, "joints", "a loop of joints without a root", "a tree of links")
     return by_child
 
 

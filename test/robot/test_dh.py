@@ -142,7 +142,8 @@ def test_standard_table_is_the_modified_one_shifted_by_a_row(tmp_path):
 # ── published tables, θ d a α in degrees and mm ──────────────────────────────────────────────────────
 
 UR10 = [  # Universal Robots' page of kinematic parameters
-    (0, 127.3, 0, 90), (0, 0, -612, 0), (0, 0, -572.3, 0), (0, 163.941, 0, 90), (0, 115.7, 0, -90), (0, 92.2, 0, 0),
+    (0, 127.3, 0, 90), (0, 0, -612, 0), (0, 0, -572.3, 0),
+    (0, 163.941, 0, 90), (0, 115.7, 0, -90), (0, 92.2, 0, 0),
 ]  # fmt: skip
 IRB120 = [  # as in lecture notes and theses on this robot, from the data sheet's lengths
     (0, 290, 0, -90), (-90, 0, 270, 0), (0, 0, 70, -90), (0, 302, 0, 90), (0, 0, 0, -90), (180, 72, 0, 0),
