@@ -117,7 +117,7 @@ def test_tables_for_people(call: Any, tmp_path: Path) -> None:
 
 
 def test_robots(call: Any) -> None:
-    assert [r["name"] for r in call("robots", "--json")["robots"]] == ["kuka_kr270", "planar_2r"]
+    assert [r["name"] for r in call("robots", "--json")["robots"]] == ["kuka_kr270", "planar_2r", "ur10e"]
     assert call("robots", "list", "--json") == call("robots", "--json")
     shown = call("robots", "show", "planar_2r", "--json")
     assert shown["joint_names"] == ["q1", "q2"] and shown["levels"]["lengths"] == ["l1", "l2"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -245,6 +246,16 @@ def test_parallel_axes_hide_their_d_and_the_twist_between_them(tmp_path):
     assert len(found.held) == 1 and "j3.d" in str(found.held) + str(found.to_dict()["unidentifiable"])
     values = dict(zip(found.parameters, found.deviations, strict=True))
     assert values["j2.d"] + values["j3.d"] == pytest.approx(1.5e-3, abs=2e-5)
+
+
+def test_the_example_of_the_conventions_page(tmp_path):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "conventions.md").read_text()
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "robot.yaml").write_text(text)
+    robot = Robot.load(tmp_path / "robot.yaml")
+    # By hand: up by 0.29, against x by 0.12 − 0.1 (the joint counts backwards), and the flange points up.
+    np.testing.assert_allclose(robot.positions([0.0, 0.1])[0, 0], [-0.02, 0.0, 0.29 + 0.072], atol=1e-15)
+    assert robot.levels["lengths"] == ("j1.d", "flange.d") and robot.levels["offsets"] == ("j1.theta", "j2.d")
 
 
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────

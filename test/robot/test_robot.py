@@ -14,7 +14,7 @@ from calib_planner.robot.elements import rotation
 
 
 def test_shipped_robots():
-    assert list(shipped_robots()) == ["kuka_kr270", "planar_2r"]
+    assert list(shipped_robots()) == ["kuka_kr270", "planar_2r", "ur10e"]
 
 
 def test_kuka_reach_and_home():
