@@ -37,9 +37,11 @@ def add_seed(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="same seed, same result (0)")
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
+def add_robot(parser: argparse.ArgumentParser, otherwise: str = "") -> None:
+    """The robot's options; ``otherwise`` says what is taken without --robot, which is required if empty."""
     group = parser.add_argument_group("robot")
-    group.add_argument("--robot", required=True, metavar="R", help="shipped name, robot YAML or URDF")
+    text = "shipped name, robot YAML or URDF" + (f" ({otherwise})" if otherwise else "")
+    group.add_argument("--robot", required=not otherwise, metavar="R", help=text)
     group.add_argument("--base-link", metavar="LINK", help="first link of the chain in a URDF (its root)")
     group.add_argument("--tip-link", metavar="LINK", help="last link of the chain in a URDF (its only leaf)")
     group.add_argument(

@@ -9,9 +9,11 @@ from typing import Any
 from calib_planner.cli.arguments import Commands, add_command
 from calib_planner.cli.plan_problem import add_problem, make_problem
 from calib_planner.cli.plan_table import show_plan, show_tried
+from calib_planner.cli.sheet import robot_pace, write_sheet
 from calib_planner.cli.terminal import Terminal
 from calib_planner.design.budget import Split, plan_for_accuracy, split_budget
 from calib_planner.design.plan import Plan
+from calib_planner.design.plan_sheet import plan_sheet
 from calib_planner.design.planner import Progress
 from calib_planner.design.planner import plan as find_plan
 from calib_planner.errors import InputError
@@ -38,6 +40,7 @@ def add(commands: Commands) -> None:
     work.add_argument("--repetitions", type=int, metavar="K", help="measurements at each of M (1)")
     parser.add_argument("--prove", action="store_true", help="make the bound rigorous, by branch and bound")
     parser.add_argument("--output", metavar="FILE", help="write the plan: .yaml, or .csv for a table")
+    parser.add_argument("--sheet", metavar="DIR", help="write the sheet for the person at the robot, see sheet")
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
@@ -61,13 +64,21 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         found = split.plan if split else find_plan(problem, report, prove=args.prove)
     if args.output:
         _write(args.output, found)
+    if args.sheet:
+        sheet = plan_sheet(
+            found, problem.robot, problem.constraints, problem.noise, pace=robot_pace(problem.robot)
+        )
+        write_sheet(args.sheet, sheet, terminal, "--sheet")
     result = found.to_dict() | (_tried(split) if split else {})
     result |= {"output": args.output} if args.output else {}
+    result |= {"sheet": args.sheet} if args.sheet else {}
     terminal.answer(result, partial(show_plan, found, problem.robot))
     if split and not args.json:
         terminal.answer({}, partial(show_tried, split))
     if args.output:
         terminal.note(f"Plan written to {args.output}")
+    if args.sheet:
+        terminal.note(f"Sheet in {args.sheet}")
 
 
 def _best(progress: Progress, criterion: str) -> str:
