@@ -4,6 +4,9 @@ The columns of the stacked, weighted Jacobian are scaled to unit length and take
 column that lies (to the tolerance) in the span of those already taken is not identifiable beside them: it is
 held at its nominal value, and the combination that the data cannot see is named. Priority: base pose and
 target offsets first — without them no residual means anything — then the order of the request.
+
+What noise leaves of a parameter beside its predecessors is a standard deviation σ/‖column ⟂ predecessors‖. One
+that could be half a metre or a radian for all the data say is as unseen as one without any column.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ from calib_planner._arrays import FloatArray
 
 TOLERANCE = 1e-6
 """A unit column this close to the span of its predecessors is taken as dependent."""
+SMALL = 1e-4
+"""Shares of a unit column below this are not part of a combination."""
 NO_LEVER = 1e-12
 """A parameter that moves the targets by less than this per unit does not move them at all [m]."""
 
@@ -30,24 +35,32 @@ class Identifiability:
         combinations: For each parameter held, the combination of parameters whose change no measurement
             shows, e.g. ``"1·joint_1.offset - 1·base.rz"`` (coefficients in parameter units).
         held: Index of the parameter held for each combination.
+        directions: (held, P) the same combinations as changes of the parameters, 1 for the one held.
+        lengths: For each parameter kept, how far it moves the points beside its predecessors, per unit
+            (length of the stacked column's part).
     """
 
     kept: tuple[int, ...]
     combinations: tuple[str, ...]
     held: tuple[int, ...]
+    directions: FloatArray
+    lengths: tuple[float, ...]
 
     @property
     def rank(self) -> int:
         return len(self.kept)
 
 
-def analyse(jacobian: FloatArray, names: Sequence[str], tolerance: float = TOLERANCE) -> Identifiability:
+def analyse(
+    jacobian: FloatArray, names: Sequence[str], tolerance: float = TOLERANCE, shortest: FloatArray | None = None
+) -> Identifiability:
     """Choose an irreducible set of parameters.
 
     Args:
         jacobian: (equations, P), weights of the equations around one [m/m | m/rad].
         names: P parameter names.
         tolerance: See ``TOLERANCE``.
+        shortest: (P,) least length of what a column adds to its predecessors; default none.
     """
     norms = np.linalg.norm(jacobian, axis=0)
     scale = np.where(norms > NO_LEVER * np.sqrt(len(jacobian)), norms, 0.0)
@@ -57,31 +70,39 @@ def analyse(jacobian: FloatArray, names: Sequence[str], tolerance: float = TOLER
     basis = np.empty((min(jacobian.shape), jacobian.shape[0]))
     kept: list[int] = []
     held: list[int] = []
-    combinations: list[str] = []
+    directions: list[FloatArray] = []
+    lengths: list[float] = []
+    least = np.zeros(len(names)) if shortest is None else shortest
     for i in order:
         rest = unit[:, i].copy()
         for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
             rest -= basis[: len(kept)].T @ (basis[: len(kept)] @ rest)
         size = float(np.linalg.norm(rest))
-        if size > tolerance and len(kept) < len(basis):
+        if size > tolerance and size * scale[i] > least[i] and len(kept) < len(basis):
             basis[len(kept)] = rest / size
             kept.append(i)
+            lengths.append(size * float(scale[i]))
         else:
             held.append(i)
-            combinations.append(_describe(unit, scale, names, kept, i))
-    return Identifiability(tuple(kept), tuple(combinations), tuple(held))
+            directions.append(_direction(unit, scale, kept, i))
+    combinations = tuple(describe(d, names, first=i) for d, i in zip(directions, held, strict=True))
+    matrix = np.array(directions).reshape(len(held), len(names))
+    return Identifiability(tuple(kept), combinations, tuple(held), matrix, tuple(lengths))
 
 
-def _describe(unit: FloatArray, scale: FloatArray, names: Sequence[str], kept: list[int], i: int) -> str:
-    """The null combination: parameter i against those that imitate it."""
-    if scale[i] == 0.0:
-        return names[i]
-    share = np.linalg.lstsq(unit[:, kept], unit[:, i], rcond=None)[0] if kept else np.zeros(0)
-    terms = [(names[i], 1.0)]
-    terms += [
-        (names[k], -value * scale[i] / scale[k])
-        for k, value in zip(kept, share, strict=True)
-        if abs(value) > 1e-4
-    ]
-    text = " ".join(f"{'+' if c >= 0 else '-'} {abs(c):.3g}·{n}" for n, c in terms)
-    return text.removeprefix("+ ")
+def _direction(unit: FloatArray, scale: FloatArray, kept: list[int], i: int) -> FloatArray:
+    """(P,) change of the parameters that no point shows: i by one, and what undoes it."""
+    direction = np.zeros(len(scale))
+    direction[i] = 1.0
+    if scale[i] > 0.0 and kept:
+        share = np.linalg.lstsq(unit[:, kept], unit[:, i], rcond=None)[0]
+        share[np.abs(share) <= SMALL] = 0.0
+        direction[kept] = -share * scale[i] / scale[kept]
+    return direction
+
+
+def describe(direction: FloatArray, names: Sequence[str], first: int) -> str:
+    """A combination in words: ``first``, then the others in their order."""
+    order = [first] + [k for k in np.flatnonzero(direction) if k != first]
+    text = " ".join(f"{'+' if direction[k] >= 0 else '-'} {abs(direction[k]):.3g}·{names[k]}" for k in order)
+    return names[first] if len(order) == 1 else text.removeprefix("+ ")

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from calib_planner._arrays import FloatArray, frozen
 from calib_planner.design.plan import plain
+from calib_planner.identification.noise_levels import NoiseLevels
+from calib_planner.identification.structure import Structure
+from calib_planner.identification.verdict import Verdict, judge
 from calib_planner.robot.chain import Robot
 
 STATUS = {
@@ -18,6 +23,8 @@ STATUS = {
     "not_converged": "The iteration did not settle: check units, joint order and signs, and the start.",
 }
 """Every status an estimate can have, with advice."""
+STRONG = 0.95
+"""Correlations beyond this are named."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,10 @@ class Validation:
         count: Number of points.
         mean, median, rms, max: After identification.
         before_mean: Mean with the nominal kinematics (only base and targets fitted).
+        predicted_rms: What the covariance, the discrepancy and the measurement noise together predict for rms;
+            NaN where it was not predicted.
+        within_95: Share of the points inside their 95 % region; NaN where it was not predicted.
+        folds: Parts of a cross-validation; 0: held-out data.
     """
 
     count: int
@@ -53,6 +64,29 @@ class Validation:
     rms: float
     max: float
     before_mean: float
+    predicted_rms: float = float("nan")
+    within_95: float = float("nan")
+    folds: int = 0
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """Whether measurement noise alone explains the residuals.
+
+    Attributes:
+        value: Sum of squares of the residuals in units of the measurement noise; NaN where that is unknown.
+        freedom: Equations less parameters.
+    """
+
+    value: float
+    freedom: int
+
+    @property
+    def probability(self) -> float:
+        """Of a sum of squares as large or larger; NaN where it is unknown."""
+        if not np.isfinite(self.value) or self.freedom < 1:
+            return float("nan")
+        return float(chi2.sf(self.value, self.freedom))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,24 +103,38 @@ class Estimate:
         std: (P,) standard deviations; NaN where held.
         covariance: (P, P), eq. (11); zero rows and columns where held.
         rank: Number of parameters identified.
-        unidentifiable: Combinations that the data cannot see.
+        unidentifiable: Combinations that neither data nor prior can see.
         held: Names of the parameters held at nominal, one per combination.
         measurements: Points given.
         used: Points used.
-        rejected: ``{row, target, reason}`` of every point not used.
-        sigma: Standard deviation of one coordinate that the covariance rests on [m].
-        sigma_estimate: The same from the residuals, NaN without redundancy [m].
-        residual_before: With nominal kinematics (base and targets fitted if unknown).
-        residual_after: With the identified parameters.
+        rejected: ``{row, target, reason, normalised_residual, residual}`` of every point not used; rows from 0,
+            targets from 1 as in the column names.
+        suspects: The same of points used although they lie beyond the gate.
+        resolved_by_prior: Combinations that the data cannot see and the prior decides.
+        nearly_dependent: Combinations that the data hardly see, weakest first.
+        prior: Where the prior came from; empty without one.
+        noise: The parts of the scatter.
+        sigma: Standard deviation of one coordinate that the covariance rests on, discrepancy included [m].
+        sigma_estimate: Scatter of one coordinate about the fit, NaN without redundancy [m].
+        chi_square: Whether measurement noise alone explains the residuals.
+        residual_before: With nominal kinematics (base and targets fitted if unknown), points used.
+        residual_after: With the identified parameters, points used.
         residuals: (N, targets, 3) measured − predicted [m], NaN where not measured.
+        normalised_residuals: (N, targets) their lengths in standard deviations of what they should be.
+        gate: Largest believable normalised residual.
         test_poses: (K, joints) [rad | m].
-        predicted_accuracy_per_test_pose: (K,) ρ0 of eq. (14) with the covariance found [m].
-        iterations: Iterations done.
+        parameter_accuracy_per_test_pose: (K,) ρ0 of eq. (14) with the covariance found [m].
+        discrepancy_per_test_pose: (K,) what no geometric model holds there, root mean square distance [m].
+        structure: Whether the residuals know where the robot stood; see ``structure``.
+        starts, agreeing_starts: Other starts made, and those that ended in the same minimum.
+        iterations: Iterations of the last fit.
         status: A key of ``STATUS``.
         message: What it means and what to do.
         seconds: Time spent.
         calibrated: The robot with the identified parameters as its nominal ones.
         validation: Statistics on held-out data, if any was given.
+        cross_validation: The same by leaving out parts of the data, if asked for.
+        required_accuracy: Largest error at a pose that the user can live with [m]; NaN: not stated.
     """
 
     robot: str
@@ -100,28 +148,41 @@ class Estimate:
     rank: int
     unidentifiable: tuple[str, ...]
     held: tuple[str, ...]
+    resolved_by_prior: tuple[str, ...]
+    nearly_dependent: tuple[str, ...]
+    prior: str
     measurements: int
     used: int
     rejected: tuple[dict[str, Any], ...]
+    suspects: tuple[dict[str, Any], ...]
     sigma: float
     sigma_estimate: float
+    noise: NoiseLevels
+    chi_square: ChiSquare
     residual_before: ResidualStatistics
     residual_after: ResidualStatistics
     residuals: FloatArray
+    normalised_residuals: FloatArray
+    gate: float
     test_poses: FloatArray
-    predicted_accuracy_per_test_pose: FloatArray
+    parameter_accuracy_per_test_pose: FloatArray
+    discrepancy_per_test_pose: FloatArray
+    structure: tuple[Structure, ...]
+    starts: int
+    agreeing_starts: int
     iterations: int
     status: str
     message: str
     seconds: float
     calibrated: Robot
     validation: Validation | None = None
+    cross_validation: Validation | None = None
+    required_accuracy: float = float("nan")
 
     def __post_init__(self) -> None:
-        for name in ("nominal", "deviations", "std", "covariance", "residuals", "test_poses"):
+        arrays = ("nominal", "deviations", "std", "covariance", "residuals", "normalised_residuals", "test_poses")
+        for name in (*arrays, "parameter_accuracy_per_test_pose", "discrepancy_per_test_pose"):
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), float)))
-        per = frozen(np.asarray(self.predicted_accuracy_per_test_pose, float))
-        object.__setattr__(self, "predicted_accuracy_per_test_pose", per)
 
     @property
     def values(self) -> FloatArray:
@@ -129,10 +190,30 @@ class Estimate:
         return self.nominal + self.deviations
 
     @property
+    def predicted_accuracy_per_test_pose(self) -> FloatArray:
+        """(K,) root mean square error expected: uncertainty of the parameters, eq. (14), and discrepancy [m]."""
+        return np.hypot(self.parameter_accuracy_per_test_pose, self.discrepancy_per_test_pose)
+
+    @property
     def predicted_accuracy(self) -> float:
-        """ρ0: root mean square over the test poses [m]; NaN without test poses."""
+        """The same over all test poses: their root mean square [m]; NaN without test poses."""
         per = self.predicted_accuracy_per_test_pose
         return float(np.sqrt(np.mean(per**2))) if per.size else float("nan")
+
+    @cached_property
+    def correlations(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of parameters correlated beyond ``STRONG``, strongest first."""
+        std = np.sqrt(np.diag(self.covariance))
+        scale = np.where(std > 0, std, np.inf)
+        matrix = self.covariance / np.outer(scale, scale)
+        found = np.argwhere(np.triu(np.abs(matrix) > STRONG, 1))
+        pairs = sorted(found.tolist(), key=lambda ij: -abs(matrix[ij[0], ij[1]]))
+        return tuple((self.parameters[i], self.parameters[j], float(matrix[i, j])) for i, j in pairs)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """PASS, WARN or FAIL with reasons; see ``verdict``."""
+        return judge(self)
 
     def with_validation(self, validation: Validation) -> Estimate:
         """The same estimate with held-out statistics attached."""
@@ -159,23 +240,40 @@ class Estimate:
             "unidentifiable": [
                 {"parameter": n, "combination": c} for n, c in zip(self.held, self.unidentifiable, strict=True)
             ],
+            "resolved_by_prior": self.resolved_by_prior,
+            "nearly_dependent": self.nearly_dependent,
+            "correlations": [{"pair": [a, b], "correlation": c} for a, b, c in self.correlations],
+            "prior": self.prior,
             "measurements": self.measurements,
             "used": self.used,
             "rejected": list(self.rejected),
+            "suspects": list(self.suspects),
+            "gate": self.gate,
             "sigma": self.sigma,
             "sigma_estimate": self.sigma_estimate,
+            "noise": asdict(self.noise),
+            "chi_square": {**asdict(self.chi_square), "probability": self.chi_square.probability},
             "residual_before": vars(self.residual_before),
             "residual_after": vars(self.residual_after),
+            "residuals": self.residuals,
+            "normalised_residuals": self.normalised_residuals,
+            "structure": [asdict(s) for s in self.structure],
+            "starts": self.starts,
+            "agreeing_starts": self.agreeing_starts,
             "iterations": self.iterations,
             "status": self.status,
             "message": self.message,
+            "verdict": asdict(self.verdict),
             "seconds": self.seconds,
         }
         if len(self.test_poses):
             result["test_poses"] = self.test_poses
             result["predicted_accuracy"] = self.predicted_accuracy
             result["predicted_accuracy_per_test_pose"] = self.predicted_accuracy_per_test_pose
-        if self.validation is not None:
-            result["validation"] = vars(self.validation)
+            result["parameter_accuracy_per_test_pose"] = self.parameter_accuracy_per_test_pose
+            result["discrepancy_per_test_pose"] = self.discrepancy_per_test_pose
+        for name in ("validation", "cross_validation"):
+            if getattr(self, name) is not None:
+                result[name] = asdict(getattr(self, name))
         plain_result: dict[str, Any] = plain(result)
         return plain_result

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from calib_planner._arrays import FloatArray, check_array, check_configurations
 from calib_planner.errors import InputError
@@ -62,7 +62,7 @@ class Measurements:
         return np.asarray(self.points)
 
     @property
-    def seen(self) -> FloatArray:
+    def seen(self) -> NDArray[np.bool_]:
         """(N, targets), whether each target was measured."""
         return ~np.isnan(self.p[:, :, 0])
 

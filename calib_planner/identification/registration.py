@@ -25,12 +25,15 @@ from calib_planner.identification.measurements import Measurements
 from calib_planner.robot.chain import Robot
 
 
-def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Robot:
+def register(
+    robot: Robot, data: Measurements, *, base: bool, tool: bool, weights: FloatArray | None = None
+) -> Robot:
     """``robot`` with the base pose and target offsets that fit the nominal kinematics best.
 
     Args:
         base: The tracker's pose is unknown; otherwise the robot's base pose is kept.
         tool: The target offsets are unknown; otherwise the robot's targets are kept.
+        weights: (N, targets) >= 0, how much each point counts; default all alike.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknowns, or all configurations alike.
@@ -40,10 +43,11 @@ def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Rob
     rotations, origins = _tip_poses(robot, data.q, at_base=base)
     row, target = np.nonzero(data.seen)
     p, r, o = data.p[row, target], rotations[row], origins[row]
+    root = np.ones(len(row)) if weights is None else np.sqrt(weights[row, target])
     offsets = robot.target_offsets
     matrix, xyz = (np.eye(3), np.zeros(3)) if base else robot.base_pose
     if base:
-        matrix = _base_rotation(p, r, o, target, None if tool else offsets)
+        matrix = _base_rotation(p, r, o, target, None if tool else offsets, root)
     targets = len(robot.targets)
     # p − R_b o = t_b + R_b R_i t, linear in t_b and t once R_b is known.
     columns = [np.broadcast_to(np.eye(3), r.shape)] if base else []
@@ -55,8 +59,8 @@ def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Rob
     right = p - (o @ matrix.T if base else o)
     if not tool:
         right = right - np.einsum("nij,nj->ni", lever, offsets[target])
-    system = np.concatenate(columns, axis=2)
-    solution = _solve(system.reshape(3 * len(row), -1), right.ravel())
+    system = np.concatenate(columns, axis=2) * root[:, None, None]
+    solution = _solve(system.reshape(3 * len(row), -1), (right * root[:, None]).ravel())
     if base:
         xyz, solution = solution[:3], solution[3:]
         robot = robot.with_base(matrix, xyz)
@@ -64,7 +68,12 @@ def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Rob
 
 
 def _base_rotation(
-    p: FloatArray, r: FloatArray, o: FloatArray, target: IntArray, offsets: FloatArray | None
+    p: FloatArray,
+    r: FloatArray,
+    o: FloatArray,
+    target: IntArray,
+    offsets: FloatArray | None,
+    root: FloatArray,
 ) -> FloatArray:
     n = len(p)
     blocks = np.zeros((n, 3, 3, 3))
@@ -78,9 +87,9 @@ def _base_rotation(
         columns.append(lever.reshape(n, 3, -1))
     else:
         right = o + np.einsum("nij,nj->ni", r, offsets[target])
-    system = np.concatenate(columns, axis=2).reshape(3 * n, -1)
+    system = (np.concatenate(columns, axis=2) * root[:, None, None]).reshape(3 * n, -1)
     # Points in one plane leave C short of a column or row; the projection restores it.
-    solution = np.linalg.lstsq(system, right.ravel(), rcond=1e-10)[0]
+    solution = np.linalg.lstsq(system, (right * root[:, None]).ravel(), rcond=1e-10)[0]
     u, values, vt = np.linalg.svd(solution[:9].reshape(3, 3))
     if values[1] < 1e-3:
         raise NotEnoughDataError(

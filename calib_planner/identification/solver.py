@@ -1,231 +1,362 @@
-"""Identification: the paper's iterative least squares, eqs. (6) and (7).
+"""Identification: from measurements to parameters, in the order in which doubt is resolved.
 
-Linearise at the current parameters, eq. (3); solve min ‖J ΔΠ − Δp‖² for the whitened, column-scaled Jacobian
-of an irreducible set of parameters (see ``identifiability``); add ΔΠ; repeat. A step that does not lower the
-sum of squares is damped (Levenberg–Marquardt): the plain iteration is what happens when nothing goes wrong.
-Afterwards cov(Π̂) = σ² (JᵀJ)⁻¹, eq. (11), with σ given, or estimated from the residuals.
+1. start       tracker pose and targets in closed form (``registration``)
+2. which       an irreducible set of parameters (``design.identifiability``)
+3. who         points to believe, if the loss is robust (``robust``)
+4. how much    the paper's iteration with weights (``least_squares``), and where the scatter comes from
+               (``noise_levels``): a fit that measurement noise does not explain gets a discrepancy, and with it
+               new weights, before 3 and 4 are looked at again
+5. how sure    other starts must end in the same place; cov(Π̂) of eq. (11) with the final weights
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.design.identifiability import Identifiability, analyse
-from calib_planner.design.information import error_variance
 from calib_planner.errors import NotEnoughDataError
-from calib_planner.identification.estimate import STATUS, Estimate, residual_statistics
+from calib_planner.identification.equations import Equations, configuration_labels, point_whitening
+from calib_planner.identification.estimate import Estimate
+from calib_planner.identification.evidence import Evidence, estimate_of
+from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.noise_levels import (
+    FEWEST_REPEATS,
+    DiscrepancyModel,
+    NoiseLevels,
+    estimate_variances,
+    improbable,
+    repeat_scatter,
+)
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
+from calib_planner.identification.robust import (
+    MEDIAN,
+    gate_of,
+    normalised,
+    residual_covariance,
+    robust_registration,
+    select,
+)
+from calib_planner.identification.suspicions import check_units
 from calib_planner.robot.chain import Robot
 
-STEP_TOLERANCE = 1e-7
-"""A step that moves the predictions by less than this share of the residuals ends the iteration."""
-STEP_FLOOR = 1e-10
-"""The same without residuals, in whitened units (standard deviations, or metres where none are known)."""
+MOST_GATES = 12
+"""Rounds of the gate; a selection that still changes then is taken as it is."""
+UNSEEN = 0.05
+"""A parameter that the data leave this uncertain is not identified by them [m | rad]."""
+START_LENGTH = 5e-3
+"""Standard deviation of the lengths of other starts [m]."""
+START_ANGLE = 2e-2
+"""The same for angles [rad]."""
 
 
-def identify(problem: IdentificationProblem) -> Estimate:
+def identify(problem: IdentificationProblem, start: Estimate | None = None) -> Estimate:
     """Identify the active parameters.
 
+    Args:
+        problem: What is asked.
+        start: Values to begin from, such as the estimate before the newest measurement; saves time, the answer
+            is the same.
+
     Raises:
-        NotEnoughDataError: Fewer equations than parameters.
+        NotEnoughDataError: Fewer equations than parameters, or fewer good points than are needed.
+        InputError: The points look like millimetres.
     """
     began = time.perf_counter()
-    robot = start_robot(problem.robot, problem.data)
-    equations = 3 * int(problem.data.seen.sum())
-    count = len(robot.parameter_names)
-    if equations < count:
-        each = 3 * problem.data.p.shape[1]
-        raise NotEnoughDataError(
-            equations,
-            count,
-            f"{equations} equations for {count} parameters: measure at least {-(-count // each)} "
-            "configurations, or ask for fewer parameters",
-        )
-    system = _System(robot, problem.data, _weights(problem))
-    fit = _iterate(system, np.zeros(count), problem.iterations)
-    return _estimate(problem, robot, system, fit, began)
+    check_units(problem.robot, problem.data)
+    seen = problem.data.seen
+    robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
+    _check_count(problem, seen)
+    work, first = _without_unseen(_Work.of(problem, robot), seen, start)
+    found = _robust(work, first) if problem.loss == "robust" else _solve(work, seen, first)
+    found, starts, agreeing = _other_starts(work, found)
+    evidence = Evidence(
+        problem=problem,
+        robot=robot,
+        equations=found.equations,
+        fit=found.fit,
+        identifiability=work.identifiability,
+        resolved=tuple(sorted(set(found.fit.kept) & set(work.identifiability.held))),
+        levels=found.levels,
+        covariance=found.covariance,
+        factor=found.factor,
+        chi_square=found.chi_square,
+        freedom=found.freedom,
+        normalised=_normalised(work, found),
+        gate=_gate(found),
+        labels=work.labels,
+        jacobian=work.jacobian,
+        starts=starts,
+        agreeing=agreeing,
+        seconds=time.perf_counter() - began,
+    )
+    return estimate_of(evidence)
 
 
-def start_robot(robot: Robot, data: Measurements) -> Robot:
+def start_robot(robot: Robot, data: Measurements, *, robust: bool = False) -> Robot:
     """``robot`` with its unknown base and targets, if any, at their closed-form values for these data."""
     active = robot.parameter_names
     base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
     tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
-    return register(robot, data, base=base, tool=tool)
+    how = robust_registration if robust else register
+    return how(robot, data, base=base, tool=tool)
 
 
-# ── the iteration ────────────────────────────────────────────────────────────────────────────────────
+# ── what stays the same while points come and go ─────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True)
-class _System:
-    """Whitened residuals and Jacobian as functions of the deviations."""
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """A problem, its robot at the start, the instrument's covariance and which parameters can be found."""
 
+    problem: IdentificationProblem
     robot: Robot
-    data: Measurements
-    weights: FloatArray  # (equations,) 1/σ of each coordinate
+    instrument: FloatArray  # (N, targets, 3, 3); the identity where nothing is known
+    source: str
+    labels: IntArray
+    jacobian: FloatArray  # (N, targets, 3, P) at the start
+    identifiability: Identifiability
+    kept: tuple[int, ...]
+
+    @staticmethod
+    def of(problem: IdentificationProblem, robot: Robot) -> _Work:
+        data = problem.data
+        instrument, source = problem.instrument_covariance()
+        jacobian = robot.jacobian(data.q).reshape(*data.p.shape, -1)
+        found = analyse(jacobian[data.seen].reshape(-1, jacobian.shape[-1]), robot.parameter_names)
+        labels = configuration_labels(data.q)
+        work = _Work(problem, robot, instrument, source, labels, jacobian, found, found.kept)
+        return work.seeing(0.0)
 
     @property
-    def mask(self) -> FloatArray:
-        """(N, targets, 3) which coordinates were measured."""
-        return np.repeat(self.data.seen[:, :, None], 3, axis=2)
+    def unit(self) -> float:
+        """Standard deviation of one coordinate that the instrument has [m]."""
+        return float(np.sqrt(np.mean(np.einsum("kii->ki", self.instrument[self.problem.data.seen]))))
 
-    def residuals(self, deviations: FloatArray) -> FloatArray:
-        """(equations,) whitened measured − predicted."""
-        predicted = self.robot.positions(self.data.q, deviations)
-        return (self.data.p - predicted)[self.mask] * self.weights
+    def seeing(self, sigma: float) -> _Work:
+        """The same with what can be seen in spite of coordinates that scatter ``sigma`` [m]."""
+        names, prior = self.robot.parameter_names, self.problem.prior
+        placed = np.array([n.startswith(("base.", "target_")) for n in names])
+        shortest = np.where(placed, 0.0, sigma / UNSEEN)
+        found = self.identifiability
+        if (np.array(found.lengths) < shortest[list(found.kept)]).any():
+            seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
+            found = analyse(seen, names, shortest=shortest)
+        kept = found.kept
+        if prior is not None and found.held:
+            # A prior is worth as many metres of the points as their scatter leaves undecided.
+            rows = (sigma or self.unit) * prior.rows(names, np.zeros(len(names)))[0]
+            seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
+            kept = analyse(np.vstack([seen, rows]), names, shortest=shortest).kept
+        return replace(self, identifiability=found, kept=kept)
 
-    def linearise(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals and whitened Jacobian (equations, P)."""
-        predicted, jacobian = self.robot.positions_and_jacobian(self.data.q, deviations)
-        residuals = (self.data.p - predicted)[self.mask] * self.weights
-        rows = jacobian.reshape(*self.data.p.shape, -1)[self.mask]
-        return residuals, rows * self.weights[:, None]
+    def equations(self, use: NDArray[np.bool_], covariance: FloatArray) -> Equations:
+        """Point by point, under ``covariance`` (N, targets, 3, 3)."""
+        whitening = point_whitening(covariance, use)
+        return Equations(self.robot, self.problem.data, use, whitening, self.problem.prior)
 
-
-@dataclass(frozen=True)
-class _Fit:
-    deviations: FloatArray
-    identifiability: Identifiability
-    jacobian: FloatArray
-    residuals: FloatArray
-    iterations: int
-    converged: bool
-
-
-def _iterate(system: _System, deviations: FloatArray, most: int) -> _Fit:
-    residuals, jacobian = system.linearise(deviations)
-    found = analyse(jacobian / system.weights.max(), system.robot.parameter_names)
-    kept = list(found.kept)
-    damping, done = 0.0, 0
-    converged = not kept
-    while kept and done < most and not converged:
-        done += 1
-        scale = np.linalg.norm(jacobian[:, kept], axis=0)
-        unit = jacobian[:, kept] / scale
-        if damping:
-            padded = np.vstack([unit, np.sqrt(damping) * np.eye(len(kept))])
-            step = np.linalg.lstsq(padded, np.append(residuals, np.zeros(len(kept))), rcond=None)[0]
-        else:
-            step = np.linalg.lstsq(unit, residuals, rcond=None)[0]
-        trial = deviations.copy()
-        trial[kept] += step / scale
-        cost, new_cost = float(residuals @ residuals), np.inf
-        if np.isfinite(trial).all():
-            new = system.residuals(trial)
-            new_cost = float(new @ new)
-        size = np.linalg.norm(unit @ step)
-        floor = STEP_FLOOR + STEP_TOLERANCE * np.linalg.norm(residuals)
-        if new_cost <= cost or size <= floor:
-            deviations = trial if new_cost <= cost else deviations
-            residuals, jacobian = system.linearise(deviations)
-            damping = 0.0 if damping < 1e-6 else damping / 10
-            converged = bool(size <= floor)
-        else:
-            damping = max(10 * damping, 1e-6)
-    return _Fit(deviations, found, jacobian, residuals, done, converged)
+    def start_values(self, start: Estimate | None) -> FloatArray:
+        """(P,) deviations to begin from."""
+        if start is None or start.parameters != self.robot.parameter_names:
+            return np.zeros(len(self.robot.parameter_names))
+        nominal = np.array([p.nominal for p in self.robot.parameters])
+        warm = np.zeros(len(nominal))
+        warm[list(self.kept)] = (start.values - nominal)[list(self.kept)]
+        return warm
 
 
-def _weights(problem: IdentificationProblem) -> FloatArray:
-    """1/σ of each measured coordinate; equal where nothing is known."""
-    mask = np.repeat(problem.data.seen[:, :, None], 3, axis=2)
-    if problem.sigma is not None:
-        return np.full(int(mask.sum()), 1.0 / problem.sigma)
-    if problem.data.std is not None:
-        return 1.0 / np.asarray(problem.data.std)[mask]
-    return np.ones(int(mask.sum()))
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A fit to some of the points and what it says about the scatter."""
+
+    equations: Equations
+    fit: Fit
+    levels: NoiseLevels
+    total: FloatArray  # (N, targets, 3, 3) Σ of each point, discrepancy included
+    factor: float  # what multiplies cov(Π̂): 1 where the noise is known
+    chi_square: float  # of measurement noise alone
+    freedom: int
+
+    @property
+    def covariance(self) -> FloatArray:
+        return self.factor * self.fit.covariance()
 
 
-# ── the answer ───────────────────────────────────────────────────────────────────────────────────────
+def _without_unseen(work: _Work, use: NDArray[np.bool_], start: Estimate | None) -> tuple[_Work, FloatArray]:
+    """What can be seen in spite of the scatter that a first fit leaves, and where that fit ended."""
+    first = work.start_values(start)
+    fit = gauss_newton(work.equations(use, work.instrument), first, work.kept, 3)
+    count = int(use.sum())
+    squares = np.sum(fit.residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
+    spare = max(3 * count - len(work.kept), 1) / (3 * count)
+    sigma = work.unit * float(np.sqrt(np.median(squares) / MEDIAN / spare))
+    work = work.seeing(sigma)
+    first[list(work.kept)] = fit.deviations[list(work.kept)]
+    return work, first
 
 
-def _estimate(problem: IdentificationProblem, robot: Robot, system: _System, fit: _Fit, began: float) -> Estimate:
-    names = robot.parameter_names
-    kept = list(fit.identifiability.kept)
-    redundancy = len(fit.residuals) - len(kept)
-    cost = float(fit.residuals @ fit.residuals)
-    factor = np.sqrt(cost / redundancy) if redundancy else float("nan")
-    unit_sigma = float(1.0 / np.sqrt(np.mean(system.weights**2)))
-    known = problem.sigma is not None or problem.data.std is not None
-    inflate = 1.0 if known or not redundancy else factor
-    covariance = np.zeros((len(names), len(names)))
-    scale = np.linalg.norm(fit.jacobian[:, kept], axis=0)
-    triangle = np.linalg.qr(fit.jacobian[:, kept] / scale, mode="r")
-    half = np.linalg.solve(triangle, np.eye(len(kept))) / scale[:, None]
-    covariance[np.ix_(kept, kept)] = inflate**2 * (half @ half.T)
-    std = np.full(len(names), np.nan)
-    std[kept] = np.sqrt(np.diag(covariance)[kept])
-    status = "ok" if fit.converged else "not_converged"
-    if fit.converged and fit.identifiability.held:
-        status = "rank_deficient"
-    predicted = robot.positions(problem.data.q, fit.deviations)
-    residuals = problem.data.p - predicted
-    before = fit_placement(robot, problem.data).positions(problem.data.q)
-    poses = problem.test_pose_array
-    parameters = robot.parameters
-    return Estimate(
-        robot=robot.name,
-        joint_names=robot.joint_names,
-        parameters=names,
-        units=tuple(p.unit for p in parameters),
-        nominal=np.array([p.nominal for p in parameters]),
-        deviations=fit.deviations,
-        std=std,
-        covariance=covariance,
-        rank=len(kept),
-        unidentifiable=fit.identifiability.combinations,
-        held=tuple(names[i] for i in fit.identifiability.held),
-        measurements=int(problem.data.seen.sum()),
-        used=int(problem.data.seen.sum()),
-        rejected=(),
-        sigma=unit_sigma * inflate,
-        sigma_estimate=unit_sigma * factor,
-        residual_before=residual_statistics(distances(problem.data.p - before)),
-        residual_after=residual_statistics(distances(residuals)),
-        residuals=residuals,
-        test_poses=poses,
-        predicted_accuracy_per_test_pose=_accuracy(robot, poses, fit.deviations, covariance, fit),
-        iterations=fit.iterations,
-        status=status,
-        message=STATUS[status],
-        seconds=time.perf_counter() - began,
-        calibrated=robot.with_deviations(dict(zip(names, fit.deviations, strict=True))),
-    )
+def _solve(work: _Work, use: NDArray[np.bool_], first: FloatArray) -> _Found:
+    """Fit the points in use and split the scatter."""
+    most = work.problem.iterations
+    instrument, source = work.instrument, work.source
+    equations = work.equations(use, instrument)
+    fit = gauss_newton(equations, first, work.kept, most)
+    seen = 3 * int(use.sum())
+    freedom = len(fit.residuals) - len(work.kept)
+    scatter, repeats = repeat_scatter(_whole(equations, fit), work.labels, use)
+    unit = float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0))
+    repeatability = float(np.sqrt(scatter)) * unit if repeats else float("nan")
+    scaled = 1.0
+    if repeats >= FEWEST_REPEATS and (source == "residuals" or improbable(scatter * repeats, repeats)):
+        instrument = scatter * instrument
+        scaled, source = (1.0, "repetitions") if source == "residuals" else (float(np.sqrt(scatter)), source)
+        equations = work.equations(use, instrument)
+        fit = gauss_newton(equations, fit.deviations, work.kept, most)
+    levels = NoiseLevels(0.0, source, scaled, repeatability, repeats)
+    if source == "residuals":
+        return _with_scale(work, equations, fit, levels, freedom)
+    cost = fit.cost
+    levels = replace(levels, measurement=float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0)))
+    found = _Found(equations, fit, levels, instrument, 1.0, cost, freedom)
+    if work.problem.discrepancy == "off" or not improbable(cost, freedom) or seen <= len(work.kept):
+        return found
+    return _with_discrepancy(work, found, instrument)
 
 
-def fit_placement(robot: Robot, data: Measurements) -> Robot:
-    """The nominal kinematics with base and targets fitted to the data where they are unknown."""
-    placement = [n for n in robot.parameter_names if n.startswith(("base.", "target_"))]
-    if not placement:
-        return robot
-    fitted = robot.with_parameters(placement)
-    weights = np.ones(3 * int(data.seen.sum()))
-    fit = _iterate(_System(fitted, data, weights), np.zeros(len(placement)), 50)
-    return robot.with_deviations(dict(zip(placement, fit.deviations, strict=True)))
+def _with_scale(work: _Work, equations: Equations, fit: Fit, levels: NoiseLevels, freedom: int) -> _Found:
+    """The noise level from the residuals themselves, eq. (11) with σ̂²."""
+    instrument, scale = work.instrument, 1.0
+    # Without a prior the parameters do not depend on the scale; with one, both settle together.
+    for _ in range(1 if equations.prior is None else 20):
+        own = fit.residuals[: 3 * int(equations.use.sum())]
+        factor = float(own @ own) / freedom if freedom > 0 else float("nan")
+        if equations.prior is None or not np.isfinite(factor) or abs(factor - 1.0) < 1e-6:
+            break
+        scale *= max(factor, 1e-12)
+        equations = work.equations(equations.use, scale * instrument)
+        fit = gauss_newton(equations, fit.deviations, work.kept, work.problem.iterations)
+    unit = float(np.sqrt(instrument[0, 0, 0, 0]))
+    levels = replace(levels, measurement=float(np.sqrt(factor * scale)) * unit)
+    total = (factor * scale if np.isfinite(factor) else 1.0) * instrument
+    inflate = factor if equations.prior is None else 1.0
+    return _Found(equations, fit, levels, total, inflate, float("nan"), freedom)
 
 
-def distances(residuals: FloatArray) -> FloatArray:
-    """Lengths (count,) [m] of the residual vectors (…, 3) that were measured."""
-    lengths = np.linalg.norm(residuals, axis=-1)
-    return lengths[np.isfinite(lengths)]
+def _with_discrepancy(work: _Work, found: _Found, instrument: FloatArray) -> _Found:
+    """The same points with the weights that their discrepancy leaves them."""
+    equations, data = found.equations, work.problem.data
+    model = DiscrepancyModel.of(equations, instrument, work.labels)
+    fit, columns = found.fit, list(found.fit.kept)
+    for _ in range(2):
+        predicted, jacobian = work.robot.positions_and_jacobian(data.q, fit.deviations)
+        rows = jacobian.reshape(*data.p.shape, -1)[equations.use].reshape(-1, jacobian.shape[-1])[:, columns]
+        prior = equations.prior_rows(fit.deviations)
+        residuals = (data.p - predicted)[equations.use].ravel()
+        variances = estimate_variances(model, residuals, rows, (prior[0][:, columns], prior[1]))
+        equations = replace(equations, whitening=model.whitening(variances))
+        fit = gauss_newton(equations, fit.deviations, fit.kept, work.problem.iterations)
+    amplitude = dict(zip(model.names, np.sqrt(variances).tolist(), strict=True))
+    spread = float(np.sqrt(model.mean_square(variances)))
+    levels = replace(found.levels, **amplitude, discrepancy=spread)
+    total = instrument + levels.discrepancy_covariance(work.robot, data.q)
+    return replace(found, equations=equations, fit=fit, levels=levels, total=total)
 
 
-def _accuracy(
-    robot: Robot, poses: FloatArray, deviations: FloatArray, covariance: FloatArray, fit: _Fit
-) -> FloatArray:
-    """ρ0 per test pose; infinite if it depends on a combination that the data cannot see."""
-    if not len(poses):
-        return np.empty(0)
-    jacobians = robot.jacobian(poses, deviations)
-    per = np.sqrt(np.einsum("kia,ab,kib->k", jacobians, covariance, jacobians) / len(robot.targets))
-    if fit.identifiability.held:
-        matrix = fit.jacobian.T @ fit.jacobian
-        blind = [not np.isfinite(error_variance(j, matrix)) for j in jacobians]
-        per[blind] = np.inf
-    return per
+def _whole(equations: Equations, fit: Fit) -> FloatArray:
+    """(N, targets, 3) whitened residuals of the points in use; zero elsewhere."""
+    whole = np.zeros(equations.data.p.shape)
+    count = 3 * int(equations.use.sum())
+    whole[equations.use] = fit.residuals[:count].reshape(-1, 3)
+    return whole
+
+
+# ── points come and go ───────────────────────────────────────────────────────────────────────────────
+
+
+def _robust(work: _Work, first: FloatArray) -> _Found:
+    """Select points, fit, and gate until the selection stands still."""
+    seen = work.problem.data.seen
+    known = work.source != "residuals"
+    selection = select(work.equations(seen, work.instrument), work.kept, first, scale_known=known)
+    use = selection.use
+    _check_count(work.problem, use)
+    found = _solve(work, use, selection.deviations)
+    for _ in range(MOST_GATES):
+        distance = _normalised(work, found)
+        with np.errstate(invalid="ignore"):
+            new = seen & (distance <= _gate(found))
+        if (new == use).all():
+            break
+        use = new
+        _check_count(work.problem, use)
+        found = _solve(work, use, found.fit.deviations)
+    return found
+
+
+def _gate(found: _Found) -> float:
+    """Largest believable normalised residual."""
+    count = int(found.equations.data.seen.sum())
+    stated = found.levels.source in ("sigma", "data", "instrument") and not found.levels.discrepancy
+    if not stated:
+        return gate_of(count, found.freedom)
+    if not improbable(found.chi_square, found.freedom):
+        return gate_of(count)
+    # No discrepancy was allowed to explain the residuals: far is what is far from the others.
+    return gate_of(count, found.freedom) * float(np.sqrt(found.chi_square / found.freedom))
+
+
+def _normalised(work: _Work, found: _Found) -> FloatArray:
+    """(N, targets) length of each residual in standard deviations of what it should be."""
+    data = work.problem.data
+    predicted, jacobian = work.robot.positions_and_jacobian(data.q, found.fit.deviations)
+    blocks = jacobian.reshape(*data.p.shape, -1)
+    covariance = residual_covariance(found.total, blocks, found.covariance, found.equations.use)
+    return normalised(data.p - predicted, covariance)
+
+
+def _check_count(problem: IdentificationProblem, use: NDArray[np.bool_]) -> None:
+    """More equations than parameters, and not more points rejected than used."""
+    count, equations = len(problem.robot.parameter_names), 3 * int(use.sum())
+    prior = 0 if problem.prior is None else len(problem.prior.names)
+    measured = int(problem.data.seen.sum())
+    if 2 * int(use.sum()) < measured:
+        raise NotEnoughDataError(
+            equations,
+            count,
+            f"only {int(use.sum())} of {measured} points agree with one another: check joint order, units and "
+            "which point belongs to which row before calibrating",
+        )
+    if equations + prior < count:
+        each = 3 * problem.data.p.shape[1]
+        raise NotEnoughDataError(
+            equations,
+            count,
+            f"{equations} equations for {count} parameters: measure at least {-(-(count - prior) // each)} "
+            "configurations, or ask for fewer parameters",
+        )
+
+
+# ── is it the only minimum? ──────────────────────────────────────────────────────────────────────────
+
+
+def _other_starts(work: _Work, found: _Found) -> tuple[_Found, int, int]:
+    """Begin elsewhere, with the same points and weights: best fit, starts made, starts that ended with it."""
+    rng = np.random.default_rng(0)
+    angle = np.array([p.unit == "rad" for p in work.robot.parameters])
+    spread = np.where(angle, START_ANGLE, START_LENGTH)
+    kept, best, agreeing = list(found.fit.kept), found.fit, 0
+    for _ in range(work.problem.starts):
+        first = found.fit.deviations.copy()
+        first[kept] += spread[kept] * rng.standard_normal(len(kept))
+        other = gauss_newton(found.equations, first, found.fit.kept, work.problem.iterations)
+        close = 1e-6 * best.cost + 1e-6
+        if other.cost < best.cost - close and other.converged:
+            best, agreeing = other, 0
+        agreeing += int(abs(other.cost - best.cost) <= close)
+    return replace(found, fit=best), work.problem.starts, agreeing

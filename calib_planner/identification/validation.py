@@ -15,10 +15,11 @@ from calib_planner._arrays import FloatArray
 from calib_planner.errors import InputError, NotEnoughDataError
 from calib_planner.identification.discrepancy import Discrepancy, fit_discrepancy
 from calib_planner.identification.estimate import Estimate, Validation
+from calib_planner.identification.evidence import distances, fit_placement
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
-from calib_planner.identification.solver import distances, fit_placement, start_robot
+from calib_planner.identification.solver import start_robot
 from calib_planner.robot.chain import Robot
 
 

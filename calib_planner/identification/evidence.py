@@ -1,0 +1,217 @@
+"""From a finished fit to the answer: eqs. (11) and (14), with both parts of the scatter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.design.identifiability import Identifiability, describe
+from calib_planner.identification.equations import Equations, point_whitening
+from calib_planner.identification.estimate import (
+    STATUS,
+    ChiSquare,
+    Estimate,
+    residual_statistics,
+)
+from calib_planner.identification.least_squares import Fit, gauss_newton
+from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.noise_levels import NoiseLevels
+from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
+from calib_planner.identification.structure import residual_structure
+from calib_planner.identification.suspicions import explain
+from calib_planner.robot.chain import Robot
+
+BLIND = 1e-5
+"""A test pose that moves less than this per unit of an unseen combination does not depend on it [m/m | m/rad]."""
+WEAK = 1e-2
+"""Unit columns whose combination is shorter than this are nearly dependent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A finished fit and everything that was found on the way; see ``Estimate`` for the meanings."""
+
+    problem: IdentificationProblem
+    robot: Robot
+    equations: Equations
+    fit: Fit
+    identifiability: Identifiability
+    resolved: tuple[int, ...]
+    levels: NoiseLevels
+    covariance: FloatArray
+    factor: float
+    chi_square: float
+    freedom: int
+    normalised: FloatArray
+    gate: float
+    labels: IntArray
+    jacobian: FloatArray
+    starts: int
+    agreeing: int
+    seconds: float
+
+
+def estimate_of(evidence: Evidence) -> Estimate:
+    """The answer."""
+    robot, fit, data = evidence.robot, evidence.fit, evidence.problem.data
+    names, parameters = robot.parameter_names, robot.parameters
+    kept = list(fit.kept)
+    std = np.full(len(names), np.nan)
+    std[kept] = np.sqrt(np.diag(evidence.covariance)[kept])
+    predicted = robot.positions(data.q, fit.deviations)
+    residuals = data.p - predicted
+    before = fit_placement(robot, data, evidence.equations).positions(data.q)
+    use = evidence.equations.use
+    held = [i for i in evidence.identifiability.held if i not in evidence.resolved]
+    combination = dict(zip(evidence.identifiability.held, evidence.identifiability.combinations, strict=True))
+    status = "rank_deficient" if held else "ok"
+    if not fit.converged:
+        status = "not_converged"
+    poses = evidence.problem.test_pose_array
+    precision, discrepancy = _accuracy(evidence, poses)
+    levels = evidence.levels
+    required = evidence.problem.required_accuracy
+    required = float("nan") if required is None else required
+    return Estimate(
+        robot=robot.name,
+        joint_names=robot.joint_names,
+        parameters=names,
+        units=tuple(p.unit for p in parameters),
+        nominal=np.array([p.nominal for p in parameters]),
+        deviations=fit.deviations,
+        std=std,
+        covariance=evidence.covariance,
+        rank=len(kept),
+        unidentifiable=tuple(combination[i] for i in held),
+        held=tuple(names[i] for i in held),
+        resolved_by_prior=tuple(combination[i] for i in evidence.resolved),
+        nearly_dependent=_nearly_dependent(fit, names),
+        prior="" if evidence.problem.prior is None else evidence.problem.prior.source,
+        measurements=int(data.seen.sum()),
+        used=int(use.sum()),
+        rejected=_rejected(evidence, predicted),
+        suspects=_suspects(evidence, predicted),
+        sigma=float(np.sqrt(levels.measurement**2 + levels.discrepancy**2)),
+        sigma_estimate=_scatter(evidence, residuals),
+        noise=levels,
+        chi_square=ChiSquare(evidence.chi_square, evidence.freedom),
+        residual_before=residual_statistics(distances((data.p - before)[use])),
+        residual_after=residual_statistics(distances(residuals[use])),
+        residuals=residuals,
+        normalised_residuals=evidence.normalised,
+        gate=evidence.gate,
+        test_poses=poses,
+        parameter_accuracy_per_test_pose=precision,
+        discrepancy_per_test_pose=discrepancy,
+        structure=residual_structure(robot, data.q, residuals, use, evidence.labels),
+        starts=evidence.starts,
+        agreeing_starts=evidence.agreeing,
+        iterations=fit.iterations,
+        status=status,
+        message=STATUS[status],
+        seconds=evidence.seconds,
+        calibrated=robot.with_deviations(dict(zip(names, fit.deviations, strict=True))),
+        required_accuracy=required,
+    )
+
+
+def fit_placement(robot: Robot, data: Measurements, equations: Equations | None = None) -> Robot:
+    """The nominal kinematics with base and targets fitted to the data where they are unknown.
+
+    Args:
+        robot: At its closed-form start.
+        data: The measurements.
+        equations: Says which points count and how; all alike by default.
+    """
+    names = robot.parameter_names
+    placement = [n for n in names if n.startswith(("base.", "target_"))]
+    if not placement:
+        return robot
+    use = data.seen if equations is None else equations.use
+    fitted = robot.with_parameters(placement)
+    unit = np.broadcast_to(UNKNOWN_SIGMA**2 * np.eye(3), (*data.p.shape, 3))
+    alike = Equations(fitted, data, use, point_whitening(unit, use))
+    fit = gauss_newton(alike, np.zeros(len(placement)), tuple(range(len(placement))), 50)
+    return robot.with_deviations(dict(zip(placement, fit.deviations, strict=True)))
+
+
+def distances(residuals: FloatArray) -> FloatArray:
+    """Lengths (count,) [m] of the residual vectors (…, 3) that were measured."""
+    lengths = np.linalg.norm(residuals, axis=-1)
+    return lengths[np.isfinite(lengths)]
+
+
+def _scatter(evidence: Evidence, residuals: FloatArray) -> float:
+    """σ̂ [m]: root of the sum of squares over the degrees of freedom, all coordinates alike; NaN without any."""
+    use = evidence.equations.use
+    freedom = 3 * int(use.sum()) - len(evidence.fit.kept)
+    return float(np.sqrt(np.sum(residuals[use] ** 2) / freedom)) if freedom > 0 else float("nan")
+
+
+def _accuracy(evidence: Evidence, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Per test pose: ρ0 of eq. (14), infinite if it rests on what the data cannot see, and discrepancy [m]."""
+    robot, fit = evidence.robot, evidence.fit
+    if not len(poses):
+        return np.empty(0), np.empty(0)
+    targets = len(robot.targets)
+    jacobians = robot.jacobian(poses, fit.deviations)
+    per = np.sqrt(np.einsum("kia,ab,kib->k", jacobians, evidence.covariance, jacobians) / targets)
+    blind = _blind(evidence, poses)
+    per[blind] = np.inf
+    spread = evidence.levels.discrepancy_covariance(robot, poses)
+    return per, np.sqrt(np.einsum("ktii->k", spread) / targets)
+
+
+def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
+    """(K,) whether a pose moves with a combination that was held because hardly any measured point does."""
+    held = [k for k, i in enumerate(evidence.identifiability.held) if i not in evidence.resolved]
+    directions = evidence.identifiability.directions[held].T
+    seen = np.linalg.norm(evidence.jacobian @ directions, axis=2).max(axis=(0, 1))
+    there = np.linalg.norm(evidence.robot.jacobian(poses) @ directions, axis=1)
+    return np.asarray((there > 10.0 * seen + BLIND).any(axis=1))
+
+
+def _nearly_dependent(fit: Fit, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Combinations of the parameters kept that the data hardly see, weakest first."""
+    if not fit.kept:
+        return ()
+    _, values, vt = np.linalg.svd(fit.triangle)
+    found = []
+    columns = list(fit.kept)
+    for value, row in zip(values[::-1], vt[::-1], strict=True):
+        if value > WEAK:
+            break
+        change = np.zeros(len(names))
+        change[columns] = np.where(np.abs(row) > 0.1 * np.abs(row).max(), row / fit.scale, 0.0)
+        first = int(np.argmax(np.abs(change)))
+        found.append(describe(change / change[first], names, first))
+    return tuple(found)
+
+
+def _rejected(evidence: Evidence, predicted: FloatArray) -> tuple[dict[str, Any], ...]:
+    """A row per point not used: where, how far off, and why."""
+    data, use = evidence.problem.data, evidence.equations.use
+    out = data.seen & ~use
+    # A point belongs to another row's prediction if it meets it as well as the used points meet theirs.
+    reach = 3.0 * float(distances((data.p - predicted)[use]).max(initial=0.0)) + 1e-6
+    words = explain(predicted, data, out, reach) if out.any() else {}
+    return tuple(_point(evidence, predicted, i, t, words.get((i, t), "")) for i, t in np.argwhere(out).tolist())
+
+
+def _suspects(evidence: Evidence, predicted: FloatArray) -> tuple[dict[str, Any], ...]:
+    """Points that were used although they lie beyond the gate."""
+    far = evidence.equations.use & (np.nan_to_num(evidence.normalised) > evidence.gate)
+    return tuple(_point(evidence, predicted, i, t, "used nevertheless") for i, t in np.argwhere(far).tolist())
+
+
+def _point(evidence: Evidence, predicted: FloatArray, i: int, t: int, words: str) -> dict[str, Any]:
+    """Row (from 0), target (from 1), reason, residual in standard deviations and in metres."""
+    length = float(evidence.normalised[i, t])
+    error = float(np.linalg.norm(evidence.problem.data.p[i, t] - predicted[i, t]))
+    reason = f"{length:.3g} standard deviations (gate {evidence.gate:.3g}), {1e3 * error:.3g} mm off"
+    reason += f"; {words}" if words else ""
+    return {"row": i, "target": t + 1, "reason": reason, "normalised_residual": length, "residual": error}

@@ -1,0 +1,223 @@
+"""Where the scatter comes from: the instrument, its repetitions, and what no geometric model holds.
+
+*Measurement noise* is what repeated measurements of one configuration show; the instrument's data sheet or the
+file's own standard deviations say how much of it to expect. *Model discrepancy* is what the residuals show beyond
+it. It is the same each time a configuration is measured, so that repetition does not average it away:
+
+    D(q) = s² I + Σ_l σ_l² c_l c_lᵀ,     c_l = ∂p/∂q_l,
+
+a part of each point's own and an error of each joint's transmission (see ``design.discrepancy``). The amplitudes
+θ = (s², σ_turning², σ_sliding²) maximise the restricted likelihood (REML; Patterson & Thompson 1971). With
+Ũ_k = L⁻¹ U_k, whitened residuals r and Q an orthonormal basis of the whitened Jacobian, for each amplitude
+
+    score_k = ½ (‖Ũ_kᵀ r‖² − ‖Ũ_k‖² + ‖Ũ_kᵀ Q‖²),     all norms within a configuration's block,
+
+the last two terms being what r owes to having been fitted. θ follows by Fisher scoring, kept from going negative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.design.discrepancy import ModelDiscrepancy
+from calib_planner.identification.equations import (
+    Equations,
+    Whitening,
+    block_whitening,
+    configuration_blocks,
+)
+from calib_planner.robot.chain import Robot
+
+FEWEST_REPEATS = 6
+"""Degrees of freedom that repetitions must have to say how noisy the measurement is."""
+DOUBT = 1e-3
+"""A fit less probable than this under measurement noise alone has a discrepancy."""
+FEWEST_SPARE = 10
+"""Redundant equations below which no discrepancy is estimated."""
+NEGLIGIBLE = 1e-3
+"""A part of the discrepancy below this share of the variance is none."""
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """The parts of the scatter; standard deviations.
+
+    Attributes:
+        measurement: Of one measured coordinate, root mean square over the points used [m].
+        source: ``sigma``, ``data``, ``instrument``, ``repetitions`` or ``residuals``.
+        scaled: Factor by which repetitions raised what the source says; 1 if they agree.
+        repeatability: What repetitions scatter [m]; NaN without repetitions.
+        repeat_freedom: Degrees of freedom of that.
+        point: s, discrepancy of each point's own, per coordinate [m].
+        turning: σ_l of turning joints [rad].
+        sliding: σ_l of sliding joints [m].
+        discrepancy: All of the discrepancy, per coordinate, root mean square over the points used [m].
+    """
+
+    measurement: float
+    source: str
+    scaled: float = 1.0
+    repeatability: float = float("nan")
+    repeat_freedom: int = 0
+    point: float = 0.0
+    turning: float = 0.0
+    sliding: float = 0.0
+    discrepancy: float = 0.0
+
+    def discrepancy_covariance(self, robot: Robot, q: FloatArray) -> FloatArray:
+        """D(q) of each target at configurations ``q``: (N, targets, 3, 3) [m²]."""
+        sigma = np.where(robot.joint_is_revolute, self.turning, self.sliding)
+        result = np.zeros((len(q), len(robot.targets), 3, 3))
+        if sigma.any():
+            columns = (robot.joint_jacobian(q) * sigma).reshape(len(q), len(robot.targets), 3, -1)
+            result += columns @ np.swapaxes(columns, 2, 3)
+        return result + self.point**2 * np.eye(3)
+
+    def for_planning(self) -> ModelDiscrepancy:
+        """The same as the planner takes it."""
+        return ModelDiscrepancy(joint_sigma=self.turning, slide_sigma=self.sliding, point_sigma=self.point)
+
+
+def repeat_scatter(residuals: FloatArray, labels: IntArray, use: NDArray[np.bool_]) -> tuple[float, int]:
+    """Scatter of repetitions about their configuration's mean.
+
+    Args:
+        residuals: (N, targets, 3) of any model, divided by their standard deviations.
+        labels: (N,) configuration of each row.
+        use: (N, targets) points that count.
+
+    Returns:
+        Mean square and its degrees of freedom.
+    """
+    total, freedom = 0.0, 0
+    for t in range(use.shape[1]):
+        rows, owner = residuals[use[:, t], t], labels[use[:, t]]
+        count = np.bincount(owner, minlength=1)
+        sums = np.stack([np.bincount(owner, rows[:, a], minlength=len(count)) for a in range(3)], axis=1)
+        apart = rows - (sums / np.maximum(count, 1)[:, None])[owner]
+        total += float(np.sum(apart**2))
+        freedom += 3 * int(np.sum(np.maximum(count - 1, 0)))
+    return (total / freedom if freedom else float("nan")), freedom
+
+
+@dataclass(frozen=True, eq=False)
+class DiscrepancyModel:
+    """The columns that spread each part of the discrepancy over the equations.
+
+    Attributes:
+        names: Parts among ``point``, ``turning``, ``sliding``.
+        columns: Per part (equations, K) U.
+        blocks: Per block size (blocks, s) numbers of the equations.
+        instrument: (points, 3, 3) R of the points in use.
+    """
+
+    names: tuple[str, ...]
+    columns: tuple[FloatArray, ...]
+    blocks: tuple[IntArray, ...]
+    instrument: FloatArray
+
+    @staticmethod
+    def of(equations: Equations, instrument: FloatArray, labels: IntArray) -> DiscrepancyModel:
+        """For the points in use; ``instrument`` (N, targets, 3, 3) [m²]."""
+        use, robot = equations.use, equations.robot
+        n, targets = use.shape
+        unit = np.broadcast_to(np.eye(3 * targets).reshape(targets, 3, -1), (n, targets, 3, 3 * targets))
+        parts = {"point": unit}
+        levers = robot.joint_jacobian(equations.data.q).reshape(n, targets, 3, -1)
+        turns = robot.joint_is_revolute
+        if turns.any():
+            parts["turning"] = levers[..., turns]
+        if not turns.all():
+            parts["sliding"] = levers[..., ~turns]
+        columns = tuple(p[use].reshape(3 * int(use.sum()), -1) for p in parts.values())
+        return DiscrepancyModel(tuple(parts), columns, configuration_blocks(labels, use), instrument[use])
+
+    def whitening(self, variances: FloatArray) -> Whitening:
+        """Of instrument and discrepancy, ``variances`` (parts,) being θ."""
+        together = np.hstack([np.sqrt(v) * c for v, c in zip(variances, self.columns, strict=True)])
+        return block_whitening(self.blocks, self.instrument, together)
+
+    def sums_of_squares(self, columns: FloatArray, rows: FloatArray) -> float:
+        """‖Ũᵀ X‖² within blocks, for whitened columns and whitened rows X (equations, m)."""
+        return float(sum(np.sum((np.swapaxes(columns[i], 1, 2) @ rows[i]) ** 2) for i in self.blocks))
+
+    def mean_square(self, variances: FloatArray) -> float:
+        """Mean variance of a coordinate [m²]."""
+        parts = [v * np.mean(np.sum(c**2, axis=1)) for v, c in zip(variances, self.columns, strict=True)]
+        return float(sum(parts))
+
+
+def improbable(cost: float, freedom: int) -> bool:
+    """Whether whitened residuals are larger than measurement noise explains."""
+    return freedom >= FEWEST_SPARE and float(chi2.sf(cost, freedom)) < DOUBT
+
+
+def estimate_variances(
+    model: DiscrepancyModel,
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    prior: tuple[FloatArray, FloatArray],
+    rounds: int = 60,
+) -> FloatArray:
+    """θ by restricted maximum likelihood.
+
+    Args:
+        model: Of the equations.
+        residuals: (equations,) measured − predicted [m], not whitened.
+        jacobian: (equations, P) of the parameters solved for, not whitened.
+        prior: (K, P) whitened rows and (K,) right-hand sides; K may be 0.
+
+    Returns:
+        (parts,) variances, zero where negligible.
+    """
+    count = len(model.columns)
+    noise = float(np.mean(np.einsum("kii->k", model.instrument))) / 3.0
+    excess = max(float(np.mean(residuals**2)) - noise, 0.01 * noise)
+    variances = np.array([excess / count / np.mean(np.sum(c**2, axis=1)) for c in model.columns])
+    for _ in range(rounds):
+        score, fisher = _score(model, residuals, jacobian, prior, variances)
+        # Unknowns θ_k/θ_k,old: no part can leave its scale in one step, nor become negative.
+        scaled = fisher * np.outer(variances, variances)
+        step = np.linalg.solve(scaled + 1e-9 * np.trace(scaled) * np.eye(count), score * variances)
+        factor = np.clip(1.0 + step, 0.2, 5.0)
+        variances = variances * factor
+        share = variances * [np.mean(np.sum(c**2, axis=1)) for c in model.columns]
+        gone = share < 0.1 * NEGLIGIBLE * (share.sum() + noise)
+        if (np.abs(factor - 1.0)[~gone] < 1e-3).all():
+            break
+    return np.where(share < NEGLIGIBLE * (share.sum() + noise), 0.0, variances)
+
+
+def _score(
+    model: DiscrepancyModel,
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    prior: tuple[FloatArray, FloatArray],
+    variances: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """∂(restricted log likelihood)/∂θ and its approximate Fisher information."""
+    whitening = model.whitening(variances)
+    white = [whitening.apply(c) for c in model.columns]
+    rows = np.vstack([whitening.apply(jacobian), prior[0]])
+    basis = np.linalg.qr(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))[0]
+    right = np.append(whitening.apply(residuals), prior[1])
+    right = right - basis @ (basis.T @ right)
+    n = len(residuals)
+    score = np.array(
+        [
+            0.5
+            * (
+                model.sums_of_squares(w, right[:n, None])
+                - float(np.sum(w**2))
+                + model.sums_of_squares(w, basis[:n])
+            )
+            for w in white
+        ]
+    )
+    fisher = np.array([[0.5 * model.sums_of_squares(a, b) for b in white] for a in white])
+    return score, fisher

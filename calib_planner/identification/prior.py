@@ -1,0 +1,94 @@
+"""What is known of the parameters before the data: a Gaussian, Π_k ~ N(m, C).
+
+A prior adds equations to the least squares (maximum a posteriori): with C = L Lᵀ, rows L⁻¹ against L⁻¹ (m − Π).
+It steadies parameters that the data hardly see, and costs a little bias in those they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import solve_triangular
+
+from calib_planner._arrays import FloatArray, check_array
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.robot.chain import Robot
+
+LENGTH_STD = 5e-4
+"""How far lengths of an assembled industrial robot typically are from the data sheet [m]."""
+ANGLE_STD = 1e-3
+"""The same for angles [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Expected values and their covariance.
+
+    Attributes:
+        names: K parameter names, each once.
+        values: (K,) expected values, not deviations [m | rad].
+        covariance: (K, K), or (K,) standard deviations of independent parameters [m | rad].
+        source: Where it comes from, in words.
+    """
+
+    names: tuple[str, ...]
+    values: ArrayLike
+    covariance: ArrayLike
+    source: str = "given"
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "names", tuple(self.names))
+        count = len(self.names)
+        if not count or len(set(self.names)) < count:
+            raise InputError("prior.names", ", ".join(self.names) or "nothing", "parameter names, each once")
+        put(self, "values", check_array("prior.values", self.values, (count,)))
+        covariance = np.asarray(self.covariance, float)
+        if covariance.ndim == 1:
+            std = check_array("prior.std", covariance, (count,))
+            if (std <= 0).any():
+                name = self.names[int(np.argmin(std))]
+                raise InputError(f"prior.std of {name}", std.min(), "a standard deviation > 0 [m | rad]")
+            covariance = np.diag(std**2)
+        covariance = check_array("prior.covariance", covariance, (count, count))
+        scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        unit = covariance / np.where(np.outer(scale, scale) > 0, np.outer(scale, scale), 1.0)
+        if (scale == 0).any() or not np.allclose(unit, unit.T, atol=1e-9) or np.linalg.eigvalsh(unit)[0] <= 1e-14:
+            raise InputError("prior.covariance", "not positive definite", "a symmetric positive definite matrix")
+        put(self, "covariance", covariance)
+
+    def rows(self, names: Sequence[str], values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The prior as equations for parameters ``names`` (P) now at ``values`` (P,).
+
+        Returns:
+            (K, P) whitened rows and (K,) right-hand sides: rows · ΔΠ = right.
+
+        Raises:
+            UnknownNameError: The prior speaks of a parameter that is not among ``names``.
+        """
+        for name in self.names:
+            if name not in names:
+                raise UnknownNameError("prior", name, list(names))
+        at = [list(names).index(n) for n in self.names]
+        scale = np.sqrt(np.diag(np.asarray(self.covariance)))
+        lower = np.linalg.cholesky(np.asarray(self.covariance) / np.outer(scale, scale))
+        inverse = solve_triangular(lower, np.diag(1.0 / scale), lower=True)
+        rows = np.zeros((len(at), len(names)))
+        rows[:, at] = inverse
+        return rows, inverse @ (np.asarray(self.values) - values[at])
+
+
+def typical_prior(robot: Robot, length_std: float = LENGTH_STD, angle_std: float = ANGLE_STD) -> Prior | None:
+    """Nominal values with typical manufacturing errors for all active parameters but base and targets.
+
+    ``None`` if there are none.
+    """
+    known = [p for p in robot.parameters if not p.name.startswith(("base.", "target_"))]
+    if not known:
+        return None
+    std = np.array([length_std if p.unit == "m" else angle_std for p in known])
+    text = f"typical: {1e3 * length_std:g} mm, {1e3 * angle_std:g} mrad"
+    return Prior(tuple(p.name for p in known), np.array([p.nominal for p in known]), std, text)

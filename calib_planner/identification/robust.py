@@ -1,0 +1,138 @@
+"""Gross errors: found before they are believed, and listed one by one.
+
+A point whose residual is d standard deviations long (Mahalanobis, three coordinates) has d² ~ χ²₃ if nothing is
+wrong with it. *Selection* starts from a fit in which far points count little, Cauchy weights w = 1/(1 + d²/c²s²)
+iterated with the scale s from the median of d², and keeps what lies inside the gate. *The gate* then judges every
+point by the fit to the others: the covariance of its residual is Σ − JCJᵀ where it took part and Σ + JCJᵀ where
+it did not. Points go and come back until the selection stands still. The gate is χ²₃ at a probability of
+``ALARM`` for the whole set: one set in a hundred loses a good point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as fisher_f
+
+from calib_planner._arrays import FloatArray
+from calib_planner.identification.equations import Equations
+from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.registration import register
+from calib_planner.robot.chain import Robot
+
+ALARM = 0.01
+"""Probability that a set without gross errors loses a point."""
+CAUCHY = 2.385
+"""c: 95 % efficient for normal errors."""
+MEDIAN = float(chi2.median(3))
+
+
+def gate_of(points: int, freedom: float = np.inf) -> float:
+    """Largest believable normalised residual of ``points`` points.
+
+    Args:
+        points: Their number.
+        freedom: Degrees of freedom of the noise level, infinite where it is known.
+    """
+    probability = ALARM / max(points, 1)
+    if np.isinf(freedom):
+        return float(np.sqrt(chi2.isf(probability, 3)))
+    return float(np.sqrt(3.0 * fisher_f.isf(probability, 3, max(freedom, 1.0))))
+
+
+def normalised(residuals: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(…,) Mahalanobis lengths of residuals (…, 3) under (…, 3, 3); NaN where not measured."""
+    seen = np.isfinite(residuals).all(axis=-1)
+    result = np.full(seen.shape, np.nan)
+    solved = np.linalg.solve(covariance[seen], residuals[seen][:, :, None])[:, :, 0]
+    result[seen] = np.sqrt(np.maximum(np.sum(solved * residuals[seen], axis=-1), 0.0))
+    return result
+
+
+def robust_registration(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Robot:
+    """``register`` with far points counting little."""
+    if not (base or tool):
+        return robot
+    weights = np.ones(data.seen.shape)
+    found = register(robot, data, base=base, tool=tool)
+    for _ in range(30):
+        lengths = np.linalg.norm(data.p - found.positions(data.q), axis=2)
+        scale = float(np.nanmedian(lengths))
+        if scale == 0.0:
+            break
+        new = np.where(data.seen, 1.0 / (1.0 + (lengths / scale) ** 2), 0.0)
+        settled = np.nanmax(np.abs(new - weights)) < 1e-3
+        weights = new
+        found = register(robot, data, base=base, tool=tool, weights=weights)
+        if settled:
+            break
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Points inside the gate and where the weighted fit ended.
+
+    Attributes:
+        use: (N, targets) bool.
+        deviations: (P,) [m | rad].
+    """
+
+    use: NDArray[np.bool_]
+    deviations: FloatArray
+
+
+def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, scale_known: bool) -> Selection:
+    """Which points to believe; ``equations`` whitened point by point, all measured points in use.
+
+    Args:
+        equations: Of all measured points.
+        kept: Parameters solved for.
+        start: (P,) deviations to begin from.
+        scale_known: The instrument's noise is known: the scale is at least one.
+    """
+    columns, deviations = list(kept), start
+    prior = 0 if equations.prior is None else len(equations.prior.names)
+    count = int(equations.use.sum())
+    freedom = max(3 * count + prior - len(columns), 1) / (3 * count + prior)
+    weights, scale = np.ones(count), 1.0
+    for _ in range(50):
+        residuals, jacobian = equations.linearise(deviations)
+        squares = np.sum(residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
+        scale = float(np.median(squares)) / MEDIAN / freedom
+        scale = max(scale, 1.0 if scale_known else 1e-300)
+        new = 1.0 / (1.0 + squares / (3.0 * CAUCHY**2 * scale))
+        root = np.sqrt(np.append(np.repeat(new, 3) / scale, np.ones(prior)))
+        rows = jacobian[:, columns] * root[:, None]
+        length = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        step = np.linalg.lstsq(rows / length, residuals * root, rcond=1e-12)[0] / length
+        deviations = deviations.copy()
+        deviations[columns] += step
+        settled = np.abs(new - weights).max() < 1e-4
+        weights = new
+        if settled:
+            break
+    squares = np.sum(equations.residuals(deviations)[: 3 * count].reshape(-1, 3) ** 2, axis=1)
+    use = equations.use.copy()
+    use[equations.use] = squares <= scale * gate_of(count) ** 2
+    return Selection(use, deviations)
+
+
+def residual_covariance(
+    covariance: FloatArray, jacobian: FloatArray, parameters: FloatArray, use: NDArray[np.bool_]
+) -> FloatArray:
+    """Covariance of each point's residual: (N, targets, 3, 3) [m²].
+
+    Args:
+        covariance: (N, targets, 3, 3) Σ of the points.
+        jacobian: (N, targets, 3, P).
+        parameters: (P, P) C of the estimate.
+        use: Whether a point took part: Σ − JCJᵀ, else Σ + JCJᵀ.
+    """
+    spread = jacobian @ parameters @ np.swapaxes(jacobian, 2, 3)
+    sign = np.where(use, -1.0, 1.0)[:, :, None, None]
+    # A point that alone determines a parameter has no residual variance: a floor keeps 0/0 at 0.
+    return covariance * (1.0 + 1e-6) + sign * spread
