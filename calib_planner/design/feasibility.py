@@ -23,6 +23,8 @@ from calib_planner.robot.posture import Posture
 
 PATIENCE = 200_000
 """Random configurations tried before a set of constraints is called empty, or nearly so."""
+RARE = 0.01
+"""Share of feasible configurations from which on rejection alone supplies as many as are wanted."""
 WITNESSES = 20_000
 """Random configurations that show which constraint empties the set."""
 
@@ -104,7 +106,7 @@ class Feasibility:
             return rng.uniform(low, high, (count, len(low)))
         found: list[FloatArray] = []
         have, tried, batch = 0, 0, max(4 * count, 1024)
-        while have < count and tried < PATIENCE:
+        while have < count and (tried < PATIENCE or have > RARE * tried):
             q = rng.uniform(low, high, (min(batch, 20_000), len(low)))
             good = q[self.mask(q)]
             found.append(good)

@@ -314,6 +314,19 @@ def test_rare_configurations_are_multiplied():
     assert ((low <= q) & (q <= high)).all()
 
 
+def test_many_configurations_are_uniform_unless_they_are_rare():
+    """None is a step from another: steps end at the joint limits, which uniform numbers never hit."""
+    robot = Robot.load("kuka_kr270")
+    box = Feasibility(robot, (WorkspaceBox([0.8, -1.2, 0.3], [2.4, 1.2, 2.3]),))
+    q = box.sample(np.random.default_rng(0), 30_000)
+    low, high = robot.joint_limits.T
+    assert q.shape == (30_000, 6) and ((low < q) & (q < high)).all()
+    fresh = np.random.default_rng(1).uniform(low, high, (400_000, 6))
+    fresh = fresh[box.mask(fresh)]
+    error = np.hypot(q.std(axis=0) / len(q) ** 0.5, fresh.std(axis=0) / len(fresh) ** 0.5)
+    assert (np.abs(q.mean(axis=0) - fresh.mean(axis=0)) < 4.5 * error).all()
+
+
 def test_joint_ranges_cost_nothing_however_narrow():
     robot = Robot.load("kuka_kr270")
     narrow = JointRange({n: [v - 0.02, v + 0.03] for n, v in zip(robot.joint_names, TEST_POSE, strict=True)})
