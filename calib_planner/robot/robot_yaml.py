@@ -157,10 +157,12 @@ class _Reader(YamlReader):
 
     def levels(self, top: Mapping[str, Any], own: Levels, known: Sequence[str]) -> Levels:
         """All levels that are not empty; ``own`` are the chain's."""
-        found = dict(own)
-        for key in ("lengths", "offsets"):
-            found[key] = self.names(key, top[key], known) if key in top else own.get(key, ())
+        found = {
+            key: self.names(key, top[key], known) if key in top else own.get(key, ())
+            for key in ("offsets", "lengths")
+        }
         found["lengths+offsets"] = (*found["lengths"], *found["offsets"])
+        found |= {key: names for key, names in own.items() if key not in found}
         further = top.get("levels", {})
         for key in self.mapping("levels", further, tuple(further) if isinstance(further, Mapping) else ()):
             name = self.text("levels", key)
