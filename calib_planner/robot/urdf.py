@@ -24,7 +24,7 @@ from calib_planner.robot.elements import Element, pose_elements
 from calib_planner.robot.joint_names import check_joint_names
 from calib_planner.robot.urdf_tree import MOVING, TreeJoint, read_chain
 
-MODEL_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
+MODEL_FORMATS = {"sdf": ", an SDF model", "mujoco": ", a MuJoCo model"}
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def parse_urdf(text: str, source: str, base_link: str | None = None, tip_link: s
             raise _xacro(source) from None
         raise FileFormatError(source, "XML", error, "well-formed XML") from None
     if root.tag != "robot":
-        got = MODEL_FORMATS.get(root.tag, f"<{root.tag}>")
+        got = f"<{root.tag}>" + MODEL_FORMATS.get(root.tag, "")
         advice = "export the robot as URDF" if root.tag in MODEL_FORMATS else ""
         raise FileFormatError(source, "root element", got, "<robot>, a URDF", advice)
     if any("xacro" in item.tag or "${" in "".join(item.attrib.values()) for item in root.iter()):
