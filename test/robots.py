@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib_planner import Robot
+from calib_planner import Plan, Robot
 from calib_planner.robot.urdf import parse_urdf
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -40,6 +40,39 @@ def random_configurations(robot: Robot, count: int, seed: int = 0) -> np.ndarray
     """(count, joints) uniform within the joint limits."""
     low, high = robot.joint_limits.T
     return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+
+
+def plan_of(robot: Robot, configurations: np.ndarray, repetitions: int = 1, **changes: object) -> Plan:
+    """A plan of these configurations (m, joints) with made-up promises; no search."""
+    count, parameters = len(configurations), robot.parameter_names
+    values: dict[str, object] = {
+        "robot": robot.name,
+        "criterion": "test_pose",
+        "parameters": parameters,
+        "joint_names": robot.joint_names,
+        "configurations": configurations,
+        "repetitions": np.full(count, repetitions),
+        "test_poses": configurations[:1],
+        "weights": np.ones(1),
+        "sigma": 3e-5,
+        "predicted_accuracy": 2e-5,
+        "predicted_accuracy_per_test_pose": np.full(1, 2e-5),
+        "parameter_std": np.full(len(parameters), 1e-4),
+        "unidentifiable": (),
+        "general_accuracy": 5e-5,
+        "value": 2e-5,
+        "value_bound": 1.5e-5,
+        "lower_bound": 1.5e-5,
+        "efficiency": 0.75,
+        "bound": "numerical",
+        "status": "ok",
+        "message": "The plan is complete.",
+        "seconds": 1.0,
+        "seed": 0,
+        "starts": 1,
+        "evaluations": 1,
+    }
+    return Plan(**{**values, **changes})  # type: ignore[arg-type]
 
 
 CASES = {
