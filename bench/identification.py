@@ -15,9 +15,10 @@
 ``sweeps``   Rows of ``joint_sweeps.csv`` predicted: from 100 random rows of ``random_poses.csv``, and from 100
              random rows of its own.
 
-The measured rows are fitted with equal weights, and with the standard deviations of the file: those are the
-tracker's, ten times smaller than what the model leaves. The table goes to stderr; the figures as JSON to FILE or
-stdout.
+Ours is measured as it comes, with a prior (typical manufacturing errors), with the robust loss, and with both.
+The measured rows carry the tracker's standard deviations, ten times smaller than what the model leaves; they are
+also fitted as plain least squares, equal weights and no discrepancy. The table goes to stderr; the figures, JSON,
+to FILE or stdout.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -38,9 +38,11 @@ import numpy as np
 
 from calib_planner import IdentificationProblem, Robot, identify
 from calib_planner._arrays import FloatArray
+from calib_planner.errors import NotEnoughDataError
 from calib_planner.files.measurements_csv import read_measurements, write_measurements
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.prior import typical_prior
 from calib_planner.robot.elements import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -51,6 +53,14 @@ LENGTH, ANGLE, SIGMA = 5e-4, 1e-3, 3e-5
 FITTED, HELD_OUT = 100, 200
 FLAT = 3e-4
 """Standard deviation given to every measured coordinate where weights are equal [m]."""
+FIGURES = ("mean_mm", "rms_mm", "rank", "used", "converged", "seconds")
+
+
+def ways(robot: Robot) -> dict[str, dict[str, Any]]:
+    """Ways of identifying: name → further arguments of the problem."""
+    prior = {"prior": typical_prior(robot)}
+    robust = {"loss": "robust"}
+    return {"ours": {}, "ours, prior": prior, "ours, robust": robust, "ours, prior, robust": prior | robust}
 
 
 # ── simulated cells ──────────────────────────────────────────────────────────────────────────────────
@@ -74,14 +84,23 @@ def asked(robot: Robot) -> Robot:
     return robot.with_targets(np.zeros_like(TARGETS)).with_parameters("full", ("base", "tool"))
 
 
-def timed(job: Callable[[], Any], repeats: int) -> list[tuple[float, float]]:
-    """Seconds of each run, by the clock and of this process."""
+def found_by(robot: Robot, data: Measurements, options: dict[str, Any]) -> Estimate:
+    """The job that is timed."""
+    return identify(IdentificationProblem(robot, data, **{"sigma": SIGMA} | options))
+
+
+def timed(robot: Robot, path: Path, options: dict[str, Any], repeats: int) -> FloatArray:
+    """(repeats, 4) seconds by the clock and of the processor, without and with reading the file."""
+    data = read_measurements(path, robot).data
     seconds = []
     for _ in range(repeats):
-        wall, own = time.perf_counter(), time.process_time()
-        job()
-        seconds.append((time.perf_counter() - wall, time.process_time() - own))
-    return seconds
+        times = [(time.perf_counter(), time.process_time())]
+        found_by(robot, data, options)
+        times.append((time.perf_counter(), time.process_time()))
+        found_by(robot, read_measurements(path, robot).data, options)
+        times.append((time.perf_counter(), time.process_time()))
+        seconds.append(np.diff(times, axis=0).ravel())
+    return np.array(seconds)
 
 
 def mean_error(points: FloatArray, truth: Measurements) -> float:
@@ -119,23 +138,20 @@ def one_cell(robot: Robot, seed: int, urdf: Path | None, python: str | None, rep
         path = Path(name) / "fit.csv"
         write_measurements(path, fitted)
         write_measurements(path.with_name("held_out.csv"), truth)
-        data = read_measurements(path, question).data
-
-        def alone() -> Estimate:
-            return identify(IdentificationProblem(question, data, sigma=SIGMA))
-
-        def from_file() -> Estimate:
-            return identify(IdentificationProblem(question, read_measurements(path, question).data, sigma=SIGMA))
-
-        times, with_file = timed(alone, repeats), timed(from_file, repeats)
+        mine = ways(question)
+        before = {name: timed(question, path, options, repeats) for name, options in mine.items()}
         theirs = figaroh(urdf, path.parent, truth, python) if urdf and python else {}
-        times, with_file = times + timed(alone, repeats), with_file + timed(from_file, repeats)
-        found = alone()
-    seconds, cpu = np.median(times, axis=0)
-    run: dict[str, Any] = {"seconds": seconds, "cpu_seconds": cpu, "first_seconds": times[0][0]}
-    run["seconds_with_file"], run["cpu_seconds_with_file"] = np.median(with_file, axis=0)
-    run |= {"error_m": mean_error(found.calibrated.positions(truth.q), truth), "parameters": found.rank}
-    return {"ours": run | {"iterations": found.iterations, "status": found.status}} | theirs
+        after = {name: timed(question, path, options, repeats) for name, options in mine.items()}
+        data = read_measurements(path, question).data
+    run: dict[str, Any] = {}
+    for name, options in mine.items():
+        keys = ("seconds", "cpu_seconds", "seconds_with_file", "cpu_seconds_with_file")
+        times = np.median(np.vstack([before[name], after[name]]), axis=0)
+        found = found_by(question, data, options)
+        run[name] = dict(zip(keys, times, strict=True)) | {"first_seconds": before[name][0, 0]}
+        run[name] |= {"error_m": mean_error(found.calibrated.positions(truth.q), truth), "parameters": found.rank}
+        run[name] |= {"used": found.used, "iterations": found.iterations, "status": found.status}
+    return run | theirs
 
 
 def compare(robot: Robot, urdf: Path | None, python: str | None, cells: int, repeats: int) -> dict[str, Any]:
@@ -147,7 +163,7 @@ def compare(robot: Robot, urdf: Path | None, python: str | None, cells: int, rep
         result["medians"][side] = {k: median(run[side][k] for run in runs) for k in keys}
     mine = result["medians"]["ours"]
     for side, theirs in result["medians"].items():
-        if side != "ours":
+        if not side.startswith("ours"):
             theirs["ratio"] = theirs["seconds"] / mine["seconds"]
             theirs["ratio_cpu"] = theirs["cpu_seconds"] / mine["cpu_seconds"]
             theirs["ratio_with_file"] = theirs["seconds"] / mine["seconds_with_file"]
@@ -162,7 +178,7 @@ def show_times(name: str, result: dict[str, Any]) -> None:
     for side, row in result["medians"].items():
         text = f"{side:<24} {row['seconds']:8.4f} {row['cpu_seconds']:8.4f} {row['parameters']:6.0f}"
         text += f" {1e6 * row['error_m']:11.2f}"
-        if side == "ours":
+        if side.startswith("ours"):
             text += f"   with the file {row['seconds_with_file']:.4f} s; first run {row['first_seconds']:.4f} s"
         else:
             text += f"   {row['ratio']:.1f}, {row['ratio_cpu']:.1f}, {row['ratio_with_file']:.1f}; "
@@ -171,11 +187,6 @@ def show_times(name: str, result: dict[str, Any]) -> None:
 
 
 # ── the measured robot ───────────────────────────────────────────────────────────────────────────────
-
-
-def estimators() -> dict[str, dict[str, Any]]:
-    """Name → further arguments of the problem."""
-    return {"equal weights": {"sigma": FLAT}, "weights of the file": {}}
 
 
 def predicted(estimate: Estimate, data: Measurements) -> FloatArray:
@@ -194,33 +205,44 @@ def measured(folder: Path, sections: list[str], seeds: int) -> list[dict[str, An
     for test, source, other in (t for s in ("random", "sweeps") if s in sections for t in tests[s]):
         for level in ("offsets", "full"):
             robot = nominal.with_parameters(level, ("base", "tool"))
-            for name, options in estimators().items():
+            plain = {"plain least squares": {"sigma": FLAT, "discrepancy": "off"}}
+            for name, options in (plain | ways(robot)).items():
                 entry: dict[str, Any] = {"test": test, "level": level, "estimator": name}
                 runs = [_one(robot, source, other, seed, options) for seed in range(seeds)]
-                result.append(entry | {key: [run[key] for run in runs] for key in runs[0]})
+                done = [run for run in runs if run]
+                entry["refused"] = len(runs) - len(done)
+                result.append(entry | {key: [run[key] for run in done] for key in FIGURES})
     return result
 
 
 def _one(
     robot: Robot, source: Measurements, other: Measurements, seed: int, options: dict[str, Any]
-) -> dict[str, float]:
-    """One random choice of rows to fit; the rows fitted take no part in the test."""
+) -> dict[str, float] | None:
+    """One random choice of rows to fit, which take no part in the test; ``None`` if identify refuses them."""
     chosen = np.random.default_rng(seed).choice(len(source), FITTED, replace=False)
     began = time.perf_counter()
-    found = identify(IdentificationProblem(robot, source.select(chosen), **options))
+    try:
+        found = identify(IdentificationProblem(robot, source.select(chosen), **options))
+    except NotEnoughDataError:
+        return None
     seconds = time.perf_counter() - began
     test = other.select(np.setdiff1d(np.arange(len(other)), chosen)) if other is source else other
     errors = predicted(found, test)
     rms = float(np.sqrt(np.mean(errors**2)))
-    return {"mean_mm": float(errors.mean()), "rms_mm": rms, "rank": found.rank, "seconds": seconds}
+    figures = (float(errors.mean()), rms, found.rank, found.used, int(found.status != "not_converged"), seconds)
+    return dict(zip(FIGURES, figures, strict=True))
 
 
 def show_errors(entries: list[dict[str, Any]]) -> None:
-    """Mean over the seeds [smallest–largest]."""
-    head = f"{'fitted→predicted':<16} {'level':<8} {'estimator':<22} {'rank':>4} {'mean mm':>22} {'rms mm':>22}"
-    print(head + f" {'ms':>6}", file=sys.stderr)
+    """Mean over the seeds [smallest–largest]; how often identify refused, and how often its iteration settled."""
+    head = f"{'fitted→predicted':<16} {'level':<8} {'estimator':<20} {'refused':>7} {'settled':>7}"
+    print(head + f" {'rank':>4} {'used':>4} {'mean mm':>23} {'rms mm':>23} {'ms':>6}", file=sys.stderr)
     for e in entries:
-        text = f"{e['test']:<16} {e['level']:<8} {e['estimator']:<22} {median(e['rank']):4.0f}"
+        text = f"{e['test']:<16} {e['level']:<8} {e['estimator']:<20} {e['refused']:7d}"
+        if not e["seconds"]:
+            print(text, file=sys.stderr)
+            continue
+        text += f" {sum(e['converged']):7d} {median(e['rank']):4.0f} {median(e['used']):4.0f}"
         for key in ("mean_mm", "rms_mm"):
             text += f"    {np.mean(e[key]):.4f} [{min(e[key]):.3f}–{max(e[key]):.3f}]"
         print(f"{text} {1e3 * median(e['seconds']):6.1f}", file=sys.stderr)
