@@ -15,7 +15,7 @@ import numpy as np
 from calib_planner._arrays import FloatArray
 from calib_planner.errors import FileFormatError
 from calib_planner.files.configurations_csv import joint_columns
-from calib_planner.files.table import Table, format_table, read_table, require_columns
+from calib_planner.files.table import Table, format_table, read_table, require_columns, shown
 from calib_planner.files.text import write_text
 from calib_planner.identification.measurements import Measurements
 from calib_planner.robot.chain import Robot
@@ -54,8 +54,8 @@ def read_measurements(path: str | Path, robot: Robot, *, degrees: bool = False) 
     ignored = tuple(c for c in table.columns if c not in known)
     for name in ignored:
         if NEARLY.fullmatch(name):
-            valid = f"{', '.join(_names(count, ''))} and std_ of each"
-            raise FileFormatError(path, f"column {name!r}", "an unknown name", valid, "rename it")
+            valid = f"{shown(_names(count, ''))} and std_ of each"
+            raise FileFormatError(path, f"column {name[:40]!r}", "an unknown name", valid, "rename it")
     return MeasurementFile(Measurements(robot.joint_names, q, points, std), ignored)
 
 

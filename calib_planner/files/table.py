@@ -1,50 +1,69 @@
-"""A CSV file as a table of text cells that know their line, so that every error can name row and column.
+"""A CSV file as a table of text that knows its lines, so that every error can name row and column.
 
 Comma, semicolon or tab separate the cells (the header decides); a byte order mark, CRLF, blank lines and
-lines that start with ``#`` are tolerated.
+lines that start with ``#`` are tolerated. Lines stay text until their numbers are asked for, a block at a time: a
+million rows take seconds and a few times the file's size.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.errors import FileFormatError
 from calib_planner.files.text import read_text
 
 MAX_ROWS = 1_000_000
+MAX_COLUMNS = 10_000
+BLOCK = 10_000
+"""Rows turned into numbers at a time."""
+MOST_LISTED = 30
+"""Column names that an error lists."""
+LINE_END = re.compile(r"\r\n|\r|\n")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
-    """Cells of a CSV file.
+    """The rows of a CSV file.
 
     Attributes:
         path: The file.
         columns: Names in the header, in its order.
-        cells: One tuple per row, in the order of ``columns``.
+        rows: Text of each row that holds something.
         lines: Line number of each row in the file, for errors.
+        mark: What separates the cells.
     """
 
     path: str
     columns: tuple[str, ...]
-    cells: tuple[tuple[str, ...], ...]
-    lines: tuple[int, ...]
+    rows: Sequence[str] = field(repr=False)
+    lines: IntArray = field(repr=False)
+    mark: str
+
+    def __len__(self) -> int:
+        return len(self.rows)
 
     def numbers(self, names: Sequence[str], *, empty: bool = False) -> FloatArray:
         """(rows, names) the named columns as numbers; an empty cell is NaN where ``empty`` allows it."""
-        at = [self.columns.index(n) for n in names]
-        out = np.empty((len(self.cells), len(at)))
-        for i, row in enumerate(self.cells):
-            for k, j in enumerate(at):
-                out[i, k] = self._number(i, names[k], row[j], empty)
+        index = {name: j for j, name in enumerate(self.columns)}
+        at = [index[n] for n in names]
+        out = np.empty((len(self), len(at)))
+        for start in range(0, len(self), BLOCK):
+            block = self.rows[start : start + BLOCK]
+            try:
+                out[start : start + len(block)] = _plain_numbers(block, self.mark, at)
+            except ValueError:  # an empty cell, or one to complain about
+                out[start : start + len(block)] = self._careful_numbers(start, block, names, at, empty)
         return out
 
     def error(self, row: int, column: str, got: str, expected: str, advice: str = "") -> FileFormatError:
@@ -52,13 +71,21 @@ class Table:
         where = f"line {self.lines[row]}, column {column}"
         return FileFormatError(self.path, where, got, expected, advice)
 
+    def _careful_numbers(
+        self, start: int, block: Sequence[str], names: Sequence[str], at: list[int], empty: bool
+    ) -> list[list[float]]:
+        return [
+            [self._number(start + i, n, cells[j], empty) for n, j in zip(names, at, strict=True)]
+            for i, cells in enumerate(_cells(s, self.mark) for s in block)
+        ]
+
     def _number(self, row: int, column: str, cell: str, empty: bool) -> float:
         if not cell:
             if empty:
                 return math.nan
             raise self.error(row, column, "an empty cell", "a number", "remove the row or fill it")
         try:
-            value = float(cell) if "_" not in cell else math.nan
+            value = float(cell) if cell.isascii() and "_" not in cell else math.nan
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
@@ -72,23 +99,35 @@ def read_table(path: str | Path, what: str) -> Table:
     """Read a CSV file with a header.
 
     Raises:
-        FileFormatError: Not readable, no header or no rows, names twice, ragged or too many rows.
+        FileFormatError: Not readable, no header or no rows, names twice, ragged or too many rows or columns.
     """
-    rows = _rows(path, what, read_text(path, what))
+    lines, rows = _filled_lines(path, read_text(path, what))
     if not rows:
         raise FileFormatError(path, "header", "an empty file", "a first line with column names")
-    header = rows[0][1]
-    doubled = sorted({n for n in header if header.count(n) > 1 and n})
+    mark = max(",;\t", key=rows[0].count)
+    header = _cells_or_error(path, lines[0], rows[0], mark, what)
+    if len(header) > MAX_COLUMNS:
+        raise FileFormatError(
+            path, "header", f"{len(header)} columns", f"at most {MAX_COLUMNS}", "leave some out"
+        )
+    doubled = sorted(n for n, count in Counter(header).items() if count > 1 and n)
     if doubled:
-        raise FileFormatError(path, "header", f"{', '.join(doubled)} twice", "each column name once")
-    body = rows[1:]
+        raise FileFormatError(path, "header", f"{shown(doubled)} twice", "each column name once")
+    body, numbers = [], []
+    for line, text in zip(lines[1:], rows[1:], strict=True):
+        count = len(_cells_or_error(path, line, text, mark, what)) if '"' in text else text.count(mark) + 1
+        if count != len(header):
+            if not text.strip(mark + " \t"):
+                continue
+            advice = "use decimal points, or semicolons between cells" if count > len(header) else ""
+            wanted = f"{len(header)} cells, one per column"
+            raise FileFormatError(path, f"line {line}", f"{count} cells", wanted, advice)
+        if text.strip(mark + ' "\t'):
+            body.append(text)
+            numbers.append(line)
     if not body:
         raise FileFormatError(path, "rows", "a header only", "at least one row of numbers")
-    for line, cells in body:
-        if len(cells) != len(header):
-            wanted = f"{len(header)} cells, one per column"
-            raise FileFormatError(path, f"line {line}", f"{len(cells)} cells", wanted)
-    return Table(str(path), header, tuple(c for _, c in body), tuple(n for n, _ in body))
+    return Table(str(path), tuple(header), body, np.array(numbers, np.int64), mark)
 
 
 def require_columns(table: Table, names: Sequence[str], what: str) -> None:
@@ -97,34 +136,22 @@ def require_columns(table: Table, names: Sequence[str], what: str) -> None:
     Raises:
         FileFormatError: Names what is missing and what the file has.
     """
-    missing = [n for n in names if n not in table.columns]
+    held, wanted = set(table.columns), set(names)
+    missing = [n for n in names if n not in held]
     if not missing:
         return
-    others = {c.casefold(): c for c in table.columns if c not in names}
+    others = {c.casefold(): c for c in table.columns if c not in wanted and len(c) <= 100}
     close = get_close_matches(missing[0].casefold(), others, n=1)
     advice = f"is {others[close[0]]!r} meant to be {missing[0]!r}?" if close else "rename or add them"
-    raise FileFormatError(
-        table.path,
-        "header",
-        f"no column {', '.join(missing)} among {', '.join(table.columns)}",
-        f"{what} {', '.join(names)}",
-        advice,
-    )
+    got = f"no column {shown(missing)} among {shown(table.columns)}"
+    raise FileFormatError(table.path, "header", got, f"{what} {shown(names)}", advice)
 
 
-def _rows(path: str | Path, what: str, text: str) -> list[tuple[int, tuple[str, ...]]]:
-    """Line number and stripped cells of every row that holds something, the header first."""
-    lines = text.splitlines()
-    kept = [(i, s) for i, s in enumerate(lines, 1) if s.strip() and not s.lstrip().startswith("#")]
-    if len(kept) > MAX_ROWS + 1:
-        raise FileFormatError(path, "rows", len(kept) - 1, f"at most {MAX_ROWS}", "split the file")
-    mark = next((m for m in ",;\t" if kept and m in kept[0][1]), ",")
-    try:
-        cells = [next(csv.reader([s], delimiter=mark, strict=True)) for _, s in kept]
-    except csv.Error as error:
-        raise FileFormatError(path, "text", error, what) from None
-    found = [(i, tuple(c.strip() for c in row)) for (i, _), row in zip(kept, cells, strict=True)]
-    return [(i, row) for i, row in found if any(row)]
+def shown(names: Sequence[str]) -> str:
+    """Names with commas between, cut to what an error line can hold and to what a terminal can show."""
+    short = [n[:40] if n.isprintable() else ascii(n[:40]) for n in names[:MOST_LISTED]]
+    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+    return ", ".join(short) + more
 
 
 def format_table(columns: Sequence[str], rows: Sequence[Sequence[float]]) -> str:
@@ -132,3 +159,49 @@ def format_table(columns: Sequence[str], rows: Sequence[Sequence[float]]) -> str
     lines = [",".join(columns)]
     lines += [",".join("" if math.isnan(v) else repr(v) for v in row) for row in rows]
     return "\n".join(lines) + "\n"
+
+
+def _filled_lines(path: str | Path, text: str) -> tuple[list[int], list[str]]:
+    """Numbers and texts of the lines that are neither blank nor comments, the header first."""
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise FileFormatError(path, f"line {line}", "a NUL character", "text", "save it as UTF-8, not UTF-16")
+    kept = [(i, s) for i, s in enumerate(_lines(text), 1) if s and not s.isspace() and s.lstrip()[0] != "#"]
+    if len(kept) > MAX_ROWS + 1:
+        raise FileFormatError(path, "rows", len(kept) - 1, f"at most {MAX_ROWS}", "split the file")
+    return [i for i, _ in kept], [s for _, s in kept]
+
+
+def _lines(text: str) -> list[str]:
+    return text.split("\n") if "\r" not in text else LINE_END.split(text)
+
+
+def _cells(text: str, mark: str) -> list[str]:
+    """Stripped cells of one line; quotes as in CSV."""
+    cells = next(csv.reader([text], delimiter=mark, strict=True)) if '"' in text else text.split(mark)
+    return [c.strip() for c in cells]
+
+
+def _cells_or_error(path: str | Path, line: int, text: str, mark: str, what: str) -> list[str]:
+    try:
+        return _cells(text, mark)
+    except csv.Error as error:
+        raise FileFormatError(
+            path, f"text of line {line}", error, what, "quotes enclose whole cells and end on their line"
+        ) from None
+
+
+def _plain_numbers(block: Sequence[str], mark: str, at: list[int]) -> FloatArray:
+    """(rows, names) of a block in which all is as it should be.
+
+    Raises:
+        ValueError: It is not: look closely.
+    """
+    if any('"' in s or "_" in s or not s.isascii() for s in block):
+        raise ValueError("quotes, underscores or other letters")
+    rows: Iterable[list[str]] = (s.split(mark) for s in block)
+    cells = chain.from_iterable([row[j] for j in at] for row in rows)
+    values = np.fromiter(map(float, cells), float, len(block) * len(at)).reshape(len(block), len(at))
+    if not np.isfinite(values).all():
+        raise ValueError("not finite")
+    return values

@@ -52,8 +52,9 @@ def decode(path: str | Path, what: str, data: bytes, encoding: str = "utf-8") ->
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
-        advice = "save it as UTF-8 text"
-        raise FileFormatError(path, "file", f"{error.reason}", f"{what}", advice) from None
+        line = data.count(b"\n", 0, error.start) + 1
+        got = f"byte 0x{data[error.start]:02x} in line {line} ({error.reason})"
+        raise FileFormatError(path, "file", got, what, "save it as UTF-8 text") from None
 
 
 def write_text(path: str | Path, text: str, field: str = "output") -> None:
