@@ -28,7 +28,7 @@ ANGLES = st.floats(-7, 7, allow_subnormal=True)
 
 def sheets() -> dict[str, PlanSheet]:
     kuka, other = Robot.load("kuka_kr270"), mixed()
-    view = (TrackerRange(np.array([4.0, 1.5, 1.2]), 1.0, 3.0),)
+    view = (TrackerRange(np.array([4.0, 1.5, 1.2]), 1.0, 4.0),)
     made = {
         "kuka": plan_sheet(plan_of(kuka, random_configurations(kuka, 6, 1), 3), kuka),
         "mixed": plan_sheet(plan_of(other, random_configurations(other, 5, 2)), other, view, start=np.zeros(4)),

@@ -1,4 +1,4 @@
-"""The trajectory: the message's fields in their order, exact positions, the timetable's times, no forbidden stop."""
+"""The trajectory: the message's fields in their order, exact positions, the timetable's times, no way out."""
 
 from __future__ import annotations
 

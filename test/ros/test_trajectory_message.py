@@ -1,7 +1,7 @@
 """The trajectory's YAML is a JointTrajectory: set field by field and read back, it is the same.
 
-``rosidl_runtime_py`` is what ``ros2 topic pub`` uses. Where it is not installed, its rules are applied here: every
-key is a field, a nested mapping a nested message, and a value has the field's type.
+``rosidl_runtime_py`` is what ``ros2 topic pub`` uses. Where that is not installed, its rules are applied here:
+every key is a field, a nested mapping a nested message, and a value has the field's type.
 """
 
 from __future__ import annotations
@@ -71,5 +71,5 @@ def test_ros2_topic_pub_takes_it() -> None:
     values = yaml.safe_load(trajectory_text(plan_sheet(plan_of(robot, random_configurations(robot, 4)), robot)))
     message = JointTrajectory()
     set_message_fields(message, values)
-    assert yaml.safe_load(yaml.safe_dump(told(message))) == values
-    assert dict(message_to_ordereddict(message)).keys() == values.keys()
+    assert told(message) == values
+    assert message_to_ordereddict(message) == values
