@@ -37,20 +37,25 @@ def add_seed(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="same seed, same result (0)")
 
 
-def add_robot(parser: argparse.ArgumentParser, otherwise: str = "") -> None:
-    """The robot's options; ``otherwise`` says what is taken without --robot, which is required if empty."""
+def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: bool = True) -> None:
+    """The robot's options; ``otherwise`` says what is taken without --robot, which is required if empty.
+
+    Without ``targets`` there is no option for the reflectors: they are as the robot says.
+    """
     group = parser.add_argument_group("robot")
     text = "shipped name, robot YAML or URDF" + (f" ({otherwise})" if otherwise else "")
     group.add_argument("--robot", required=not otherwise, metavar="R", help=text)
     group.add_argument("--base-link", metavar="LINK", help="first link of the chain in a URDF (its root)")
     group.add_argument("--tip-link", metavar="LINK", help="last link of the chain in a URDF (its only leaf)")
-    group.add_argument(
-        "--targets",
-        action="append",
-        type=numbers,
-        metavar='"x y z"',
-        help="a reflector in the frame of the last link [m]; repeat for several",
-    )
+    parser.set_defaults(targets=None)
+    if targets:
+        group.add_argument(
+            "--targets",
+            action="append",
+            type=numbers,
+            metavar='"x y z"',
+            help="a reflector in the frame of the last link [m]; repeat for several",
+        )
     group.add_argument(
         "--degrees",
         action="store_true",

@@ -192,7 +192,8 @@ def _axis(elements: Sequence[Element], span: _Span) -> FloatArray:
 
 def _pose(elements: Sequence[Element]) -> tuple[FloatArray, FloatArray]:
     """Rotation (3, 3) and position (3,) [m] after these elements, joints at zero."""
-    r, p = np.eye(3), np.zeros(3)
+    r: FloatArray = np.eye(3)
+    p: FloatArray = np.zeros(3)
     for e in elements:
         amount = e.sign * e.value
         if e.is_rotation:

@@ -1,0 +1,129 @@
+"""``calib-planner compensate``: joint targets corrected for a controller that cannot change its model."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from calib_planner._arrays import FloatArray
+from calib_planner.cli.arguments import Commands, add_command, add_robot, add_seed, load_robot, numbers
+from calib_planner.cli.terminal import Terminal
+from calib_planner.errors import InputError
+from calib_planner.files.calibrated_robot import calibrated_robot
+from calib_planner.files.configurations_csv import read_configurations
+from calib_planner.files.estimate_yaml import read_estimate
+from calib_planner.files.table import format_table
+from calib_planner.files.text import write_text
+from calib_planner.robot.chain import Robot
+from calib_planner.robot.compensation import STATUS, Compensation, compensate
+
+EXAMPLE = """calib-planner compensate --robot arm.urdf --estimate estimate.yaml \\
+      --targets path.csv --output corrected.csv"""
+
+DESCRIPTION = """Correct joint targets so that the real tool goes where the nominal model says.
+
+The CSV of targets has a column per joint [rad | m], in any order. What is written has the same rows: the
+corrected joints [rad | m], what remains (position_error [m], rotation_error [rad]), and reached: 1, or 0 where
+the row could not be reached exactly and is the closest there is. Joint limits are respected. Where the base
+stands before the tracker plays no part."""
+
+ERRORS = ("position_error", "rotation_error", "reached")
+
+
+def add(commands: Commands) -> None:
+    """Add the command's parser."""
+    summary = "corrected joint targets for a controller with the nominal model"
+    parser = add_command(commands, "compensate", summary, run, EXAMPLE, DESCRIPTION)
+    add_robot(parser, targets=False)
+    what = parser.add_argument_group("what to correct")
+    what.add_argument("--estimate", required=True, metavar="FILE", help="what identify --output wrote")
+    what.add_argument(
+        "--targets", required=True, metavar="FILE", dest="joint_targets", help="CSV of joint targets [rad | m]"
+    )
+    what.add_argument(
+        "--position-only",
+        action="store_true",
+        help="only the position of a point counts, not how the tool is turned",
+    )
+    what.add_argument(
+        "--tool",
+        type=numbers,
+        metavar='"x y z"',
+        help="that point, in the frame of the last link [m] (target 1: as nominal, and as identified)",
+    )
+    what.add_argument("--ignore-limits", action="store_true", help="joint limits do not matter")
+    add_seed(parser)
+    parser.add_argument("--output", metavar="FILE", help="CSV of corrected targets (stdout without --json)")
+
+
+def run(args: argparse.Namespace, terminal: Terminal) -> None:
+    """Do the work."""
+    nominal = load_robot(args)
+    calibrated = calibrated_robot(nominal, read_estimate(args.estimate))
+    if args.tool is not None:
+        nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
+    q = read_configurations(args.joint_targets, nominal, degrees=args.degrees)
+    with terminal.working("correcting"):
+        found = compensate(
+            nominal, calibrated, q, position_only=args.position_only, limits=not args.ignore_limits
+        )
+    if args.output:
+        write_text(args.output, _csv(found), "--output")
+    elif not args.json:
+        print(_csv(found), end="")
+    answer = {
+        "robot": nominal.name,
+        **found.to_dict(),
+        "position_only": args.position_only,
+        "output": args.output,
+    }
+    if args.json:
+        terminal.answer(answer, lambda console: None)
+    else:
+        show_compensation(found, terminal.out if args.output else terminal.err)
+    for status, count in Counter(found.status).items():
+        if status != "reached":
+            terminal.note(f"{count} of {len(found.status)} targets {status}: {STATUS[status]}")
+
+
+def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:
+    if not args.position_only:
+        raise InputError("--tool", "a point", "--position-only beside it", "the pose is that of the last link")
+    if len(args.tool) != 3 or not np.isfinite(args.tool).all():
+        raise InputError("--tool", f"{len(args.tool)} numbers", "3 finite numbers: x, y, z [m]")
+    return robot.with_targets([args.tool])
+
+
+def _csv(found: Compensation) -> str:
+    errors = [found.position_error, found.rotation_error]
+    rows: list[list[Any]] = np.column_stack([found.corrected, *errors]).tolist()
+    for row, reached in zip(rows, found.reached.tolist(), strict=True):
+        row.append(int(reached))
+    return format_table([*found.joint_names, *ERRORS], rows)
+
+
+def show_compensation(found: Compensation, console: Console) -> None:
+    """Print what the correction does, in mm and mrad."""
+    table = Table("tool against nominal", title=f"{len(found.status)} targets")
+    for column in ("mean", "largest"):
+        table.add_column(column, justify="right")
+    rows = [
+        ("position uncorrected [mm]", found.position_error_before),
+        ("position corrected [mm]", found.position_error),
+        ("rotation uncorrected [mrad]", found.rotation_error_before),
+        ("rotation corrected [mrad]", found.rotation_error),
+        ("joint correction [mrad | mm]", np.abs(found.corrected - found.targets).max(axis=1)),
+    ]
+    for label, values in rows:
+        if not np.isnan(values).any():
+            table.add_row(label, *(f"{1e3 * v:.4g}" for v in _mean_and_largest(values)))
+    console.print(table)
+
+
+def _mean_and_largest(values: FloatArray) -> tuple[float, float]:
+    return float(values.mean()), float(values.max())
