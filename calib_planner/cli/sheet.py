@@ -153,7 +153,7 @@ def _stops(sheet: PlanSheet) -> Table:
     turns = sheet.robot.joint_is_revolute
     for name, turning in zip(sheet.plan.joint_names, turns, strict=True):
         table.add_column(f"{name}\n[{'°' if turning else 'mm'}]", justify="right")
-    for heading in ("measure", "travel\nmax", "reach", "visible"):
+    for heading in ("times", "travel\nmax", "reach", "visible"):
         table.add_column(heading, justify="right")
     visible = sheet.checks.visible
     for i, row in enumerate(sheet.degrees):
