@@ -111,7 +111,7 @@ def read_bag(
 
 
 def _check_streams(path: str | Path, streams: tuple[Stream, ...], joint_names: Sequence[str]) -> None:
-    for stream in streams:
+    for number, stream in enumerate(streams):
         where = f"topic {stream.topic}"
         if not stream.messages:
             raise FileFormatError(path, where, "no messages", "at least one standstill's", "was the driver on?")
@@ -121,8 +121,9 @@ def _check_streams(path: str | Path, streams: tuple[Stream, ...], joint_names: S
             if stream.left_out.get(UNSTAMPED):
                 advice = "the driver has to fill header.stamp"
             elif stream.left_out.get(UNFIT):
-                advice = f"the robot's joints are {', '.join(joint_names)}: rename them in its file"
-            raise FileFormatError(path, where, got, "stamped, finite messages with the robot's joints", advice)
+                advice = f"each message has to name and position {', '.join(joint_names)}"
+            wanted = "stamped, finite points" if number else "stamped, finite positions of the robot's joints"
+            raise FileFormatError(path, where, got, wanted, advice)
     joints = streams[0]
     for points in streams[1:]:
         apart = max(points.first - joints.last, joints.first - points.last)  # type: ignore[operator]

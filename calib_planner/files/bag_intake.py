@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from calib_planner._arrays import FloatArray
-from calib_planner.errors import FileFormatError, InputError
+from calib_planner.errors import FileFormatError, InputError, UnknownNameError
 from calib_planner.files.bag_storage import BagTopics, BrokenStorage, Recording
-from calib_planner.instrument.joint_state import pick_joints
+from calib_planner.instrument.joint_state import MOST_NAMES, pick_joints
 from calib_planner.instrument.standstill import (
     NANO,
     Rejection,
@@ -144,7 +144,8 @@ class Intake:
         try:
             joints = pick_joints(message.name, message.position, self.joint_names)
         except InputError as error:
-            tally.leave_out(UNFIT, str(error))
+            names = f"it names {', '.join(message.name[:MOST_NAMES])}"
+            tally.leave_out(UNFIT, names if isinstance(error, UnknownNameError) else str(error))
             return
         tally.count(stamp, joints)
         self._sort(self._detector.add_joints(stamp, joints))
