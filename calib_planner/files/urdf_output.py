@@ -30,6 +30,8 @@ ATTRIBUTE = re.compile(rb"""\s+([^\s=/>"']+)\s*=\s*("[^"]*"|'[^']*')""")
 """One attribute; of a document that is well formed, which the parser has checked."""
 
 AXIS_TOLERANCE = 1e-9
+X_AXIS = "1 0 0"
+"""What URDF takes where no axis is given."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class _Joint:
     inside: int = -1  # of the first child
     origin: int = -1  # of <origin>
     numbers: dict[str, str] = field(default_factory=dict)  # attributes of <origin>
-    axis: str | None = None
+    axis: str | None = None  # attribute xyz of <axis>
 
 
 def write_calibrated_urdf(
@@ -89,7 +91,7 @@ def calibrated_urdf(text: str, robot: Robot, source: str = "URDF") -> tuple[str,
     """
     _refuse_other_robots(robot, "robot")
     data = text.encode("utf-8")
-    joints = _find_joints(data, source)
+    joints = _find_joints(data, source, robot.joint_names)
     wanted = joint_origins(robot)
     edits: list[tuple[int, int, bytes]] = []
     changed = []
@@ -111,8 +113,8 @@ def _refuse_other_robots(robot: Robot, field: str) -> None:
 # ── finding ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _find_joints(data: bytes, source: str) -> dict[str, _Joint]:
-    """The joints directly below ``<robot>``, as ``parse_urdf`` sees them; others are other programs'."""
+def _find_joints(data: bytes, source: str, names: tuple[str, ...]) -> dict[str, _Joint]:
+    """The robot's joints, directly below ``<robot>``; those elsewhere are other programs'."""
     joints: dict[str, _Joint] = {}
     open_tags: list[str] = []
     current: list[_Joint] = []
@@ -122,7 +124,7 @@ def _find_joints(data: bytes, source: str) -> dict[str, _Joint]:
         at = parser.CurrentByteIndex
         if open_tags == ["robot"] and tag == "joint":
             name = attributes.get("name", "")
-            if name in joints:
+            if name in joints and name in names:
                 raise FileFormatError(source, f"joint {name!r}", "twice", "each joint name once")
             joints[name] = _Joint()
             current[:] = [joints[name]]
@@ -149,7 +151,7 @@ def _note_child(joint: _Joint, tag: str, attributes: dict[str, str], at: int) ->
     if tag == "origin" and joint.origin < 0:
         joint.origin, joint.numbers = at, attributes
     elif tag == "axis" and joint.axis is None:
-        joint.axis = attributes.get("xyz", "")
+        joint.axis = attributes.get("xyz", X_AXIS)
 
 
 # ── changing ─────────────────────────────────────────────────────────────────────────────────────────
@@ -161,8 +163,8 @@ def _edits(
     """What to replace, as (start, end, new), so that the joint has this origin."""
     if joint is None:
         raise FileFormatError(source, f"joint {name!r}", "nothing", "this joint of the robot", "give its URDF")
-    axis = _numbers("1 0 0" if joint.axis is None else joint.axis)
-    if axis is None or np.abs(axis / (np.linalg.norm(axis) or 1.0) - wanted.axes[name]).max() > AXIS_TOLERANCE:
+    axis = _numbers(joint.axis or X_AXIS)
+    if axis is None or np.abs(_unit(axis) - wanted.axes[name]).max() > AXIS_TOLERANCE:
         expected = f"{_text(wanted.axes[name])}, the robot's"
         raise FileFormatError(source, f"joint {name!r} axis", joint.axis, expected, "give the robot's own URDF")
     values = {"xyz": origin.xyz, "rpy": origin.rpy}
@@ -208,6 +210,11 @@ def _replaced(old: str, value: FloatArray) -> str:
 def _says(text: str, value: FloatArray) -> bool:
     numbers = _numbers(text)
     return numbers is not None and bool((numbers == value).all())
+
+
+def _unit(direction: FloatArray) -> FloatArray:
+    direction = direction / (np.abs(direction).max() or 1.0)
+    return direction / (np.linalg.norm(direction) or 1.0)
 
 
 def _numbers(text: str) -> FloatArray | None:

@@ -21,7 +21,7 @@ TRICKY = """<?xml version='1.0' encoding="utf-8"?>
   <ros2_control name="c" type="system"><joint name="turn"><origin xyz="7 7 7"/></joint></ros2_control>
   <transmission name="t"><joint name="slide"><hardwareInterface>X</hardwareInterface></joint></transmission>
   <gazebo reference="turn"><origin xyz="8 8 8"/></gazebo>
-  <xacro:joint name="turn"/>
+  <x:joint name="turn"><origin xyz="4 4 4"/></x:joint>
   <joint name="turn" type="revolute">
 \t\t<!-- no origin --> <parent link="base"/>
     <child link="a"/><axis xyz="0 3 4"/><limit lower="-2" upper="2.5" effort="1" velocity="1"/>
@@ -167,7 +167,7 @@ def test_files_keep_their_bytes(tmp_path: Path, prefix: bytes, newline: bytes) -
         (TRICKY[:-60], "well-formed"),
         (TRICKY.replace('<joint name="spin"', '<joint name="spun"'), "joint 'spin'"),
         (TRICKY.replace('xyz="0 3 4"', 'xyz="0 3 -4"'), "joint 'turn' axis"),
-        (TRICKY.replace('<joint name="plate"', '<joint name="turn"'), "'turn'"),
+        (TRICKY.replace('<joint name="plate"', '<joint name="turn"'), "twice"),
     ],
 )
 def test_other_files_are_refused(text: str, needle: str) -> None:
