@@ -9,7 +9,7 @@ from typing import Any
 from calib_planner.cli.arguments import Commands, add_command
 from calib_planner.cli.plan_problem import add_problem, make_problem
 from calib_planner.cli.plan_table import show_plan, show_tried
-from calib_planner.cli.sheet import robot_pace, write_sheet
+from calib_planner.cli.sheet import make_folder, robot_pace, write_sheet
 from calib_planner.cli.terminal import Terminal
 from calib_planner.design.budget import Split, plan_for_accuracy, split_budget
 from calib_planner.design.plan import Plan
@@ -109,6 +109,8 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError("--prove", "with --measurements or --accuracy", "--configurations beside it")
     if args.output and not args.output.lower().endswith((".yaml", ".yml", ".csv")):
         raise InputError("--output", repr(args.output), "a name that ends in .yaml or .csv")
+    if args.sheet:
+        make_folder(args.sheet, "--sheet")  # refused before the search, not after it
 
 
 def _write(output: str, found: Plan) -> None:

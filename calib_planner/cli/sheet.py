@@ -101,22 +101,31 @@ def write_sheet(folder: str, sheet: PlanSheet, terminal: Terminal, field: str = 
     Raises:
         InputError: The folder cannot be made or written to; names ``field``.
     """
-    target = Path(folder).expanduser()
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        if not sheet.checks.reachable.all():
-            (target / FILES[3]).unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(
-            field, f"{folder} ({error.strerror})", "a folder that can be made", "choose another"
-        ) from None
+    target, reachable = make_folder(folder, field), bool(sheet.checks.reachable.all())
+    if not reachable:
+        (target / FILES[3]).unlink(missing_ok=True)
     writers = (write_sheet_page, write_sheet_csv, write_sheet_yaml, write_trajectory)
-    written = FILES if sheet.checks.reachable.all() else FILES[:3]
+    written = FILES if reachable else FILES[:3]
     for name, write in zip(written, writers, strict=False):
         write(target / name, sheet, field)
     if len(written) < len(FILES):
         terminal.note("No trajectory was written: not every stop is reachable.")
     return list(written)
+
+
+def make_folder(folder: str, field: str = "--output") -> Path:
+    """The folder, made if it is not there.
+
+    Raises:
+        InputError: It cannot be made; names ``field``.
+    """
+    target = Path(folder).expanduser()
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = f"{folder} ({error.strerror})"
+        raise InputError(field, reason, "a folder that can be made", "choose another") from None
+    return target
 
 
 def show_sheet(sheet: PlanSheet, console: Console) -> None:
@@ -152,9 +161,9 @@ def _stops(sheet: PlanSheet) -> Table:
     table.add_column("#", justify="right")
     turns = sheet.robot.joint_is_revolute
     for name, turning in zip(sheet.plan.joint_names, turns, strict=True):
-        table.add_column(f"{name}\n[{'°' if turning else 'mm'}]", justify="right")
+        table.add_column(f"{name}\n[{'°' if turning else 'mm'}]", justify="right", overflow="fold")
     for heading in ("times", "travel\nmax", "reach", "visible"):
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", overflow="fold")
     visible = sheet.checks.visible
     for i, row in enumerate(sheet.degrees):
         table.add_row(

@@ -6,6 +6,7 @@ The page says what was checked and what was not; a cell is empty or says ``not c
 from __future__ import annotations
 
 from html import escape
+from math import ceil
 from pathlib import Path
 from string import Template
 
@@ -22,8 +23,8 @@ from calib_planner.report.quantities import duration, length, signed
 TEMPLATE = Path(__file__).parent / "templates" / "plan_sheet.html"
 BOXES = 12
 """More repetitions than this get one box with their number."""
-COLUMNS = 7
-"""Joints beside each other."""
+COLUMNS = 6
+"""Joints beside each other; more are spread evenly over several lines."""
 
 
 def write_sheet_page(path: str | Path, sheet: PlanSheet, field: str = "output") -> None:
@@ -50,7 +51,7 @@ def sheet_page(sheet: PlanSheet) -> str:
         alarms="\n".join(f'<p class="safety alarm"><strong>{escape(a)}</strong></p>' for a in _alarms(sheet)),
         never=_sentence(NEVER),
         told="\n".join(f"<p>{line}</p>" for line in _told(sheet)),
-        columns=str(min(len(turns), COLUMNS)),
+        columns=str(ceil(len(turns) / ceil(len(turns) / COLUMNS))),
         stops=str(len(plan.configurations)),
         measurements=str(plan.measurements),
         units="; ".join(units),

@@ -137,6 +137,15 @@ def test_plan_writes_its_sheet(tmp_path, capsys):
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
 
 
+def test_plan_refuses_a_sheet_that_cannot_be_before_it_searches(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    arguments = ("--robot", "planar_2r", "--test-pose", "0 0", "--configurations", "3")
+    output = tmp_path / "plan.yaml"
+    more = ("--sheet", str(tmp_path / "file" / "x"), "--output", str(output))
+    status, out, err = call(capsys, "plan", *arguments, *more)
+    assert status == 2 and not out and "--sheet" in err and not output.exists()
+
+
 @pytest.mark.parametrize(
     ("options", "status", "words"),
     [
