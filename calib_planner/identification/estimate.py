@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -214,10 +214,6 @@ class Estimate:
     def verdict(self) -> Verdict:
         """PASS, WARN or FAIL with reasons; see ``verdict``."""
         return judge(self)
-
-    def with_validation(self, validation: Validation) -> Estimate:
-        """The same estimate with held-out statistics attached."""
-        return replace(self, validation=validation)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""

@@ -20,7 +20,9 @@ from calib_planner.robot.chain import Robot
 LENGTH_STD = 5e-4
 """How far lengths of an assembled industrial robot typically are from the data sheet [m]."""
 ANGLE_STD = 1e-3
-"""The same for angles [rad]."""
+"""The same for angles between axes [rad]."""
+OFFSET_STD = 0.05
+"""The same for the zeros of joints, which are set by hand, in any unit [rad | m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +86,29 @@ class Prior:
 def typical_prior(robot: Robot, length_std: float = LENGTH_STD, angle_std: float = ANGLE_STD) -> Prior | None:
     """Nominal values with typical manufacturing errors for all active parameters but base and targets.
 
-    ``None`` if there are none.
+    Joint zeros get ``OFFSET_STD``, next to nothing. ``None`` if there is no parameter left.
     """
+    zeros = _joint_zeros(robot)
     known = [p for p in robot.parameters if not p.name.startswith(("base.", "target_"))]
     if not known:
         return None
-    std = np.array([length_std if p.unit == "m" else angle_std for p in known])
+    usual = {"m": length_std, "rad": angle_std}
+    std = np.array([OFFSET_STD if p.name in zeros else usual[p.unit] for p in known])
     text = f"typical: {1e3 * length_std:g} mm, {1e3 * angle_std:g} mrad"
     return Prior(tuple(p.name for p in known), np.array([p.nominal for p in known]), std, text)
+
+
+def _joint_zeros(robot: Robot) -> set[str]:
+    """Names of the active parameters that act as a joint does, wherever the robot stands."""
+    low, high = robot.joint_limits.T
+    sample = np.random.default_rng(0).uniform(low, high, (8, len(low)))
+    columns, joints = robot.jacobian(sample), robot.joint_jacobian(sample)
+    size = np.abs(joints).max()
+    return {
+        name
+        for k, name in enumerate(robot.parameter_names)
+        if any(
+            min(np.abs(columns[..., k] - s * joints[..., j]).max() for s in (1, -1)) < 1e-9 * size
+            for j in range(joints.shape[2])
+        )
+    }

@@ -48,6 +48,8 @@ from calib_planner.robot.chain import Robot
 
 MOST_GATES = 12
 """Rounds of the gate; a selection that still changes then is taken as it is."""
+FIRST_ITERATIONS = 3
+"""Iterations of the fit that tells how much the points scatter, roughly."""
 UNSEEN = 0.05
 """A parameter that the data leave this uncertain is not identified by them [m | rad]."""
 START_LENGTH = 5e-3
@@ -191,7 +193,9 @@ class _Found:
 def _without_unseen(work: _Work, use: NDArray[np.bool_], start: Estimate | None) -> tuple[_Work, FloatArray]:
     """What can be seen in spite of the scatter that a first fit leaves, and where that fit ended."""
     first = work.start_values(start)
-    fit = gauss_newton(work.equations(use, work.instrument), first, work.kept, 3)
+    if work.problem.iterations <= FIRST_ITERATIONS:
+        return work, first
+    fit = gauss_newton(work.equations(use, work.instrument), first, work.kept, FIRST_ITERATIONS)
     count = int(use.sum())
     squares = np.sum(fit.residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     spare = max(3 * count - len(work.kept), 1) / (3 * count)

@@ -61,7 +61,7 @@ CASES = {
     "targets": (f"{PLAN} 2 --test-pose 0,0 --targets 1,2", 2, ["--targets", "3 numbers: x, y, z"]),
     "plan's ending": (f"{PLAN} 2 --test-pose 0,0 --output p.txt", 2, ["--output", ".yaml or .csv"]),
     "output folder": (f"{PLAN} 2 --test-pose 0,0 --output no/p.csv", 2, ["--output", "No such file"]),
-    "loss": (f"{IDENTIFY} good.csv --loss robust", 2, ["--loss", "linear"]),
+    "loss": (f"{IDENTIFY} good.csv --loss square", 2, ["--loss", "linear"]),
     "target from": (f"{IDENTIFY} good.csv --validate-target-from 1", 2, ["--validate FILE"]),
     "true name": (f"{SIMULATE} good.csv --true l9=1", 2, ["deviations", "'l9'", "l1"]),
     "true text": (f"{SIMULATE} good.csv --true l1", 2, ["NAME=VALUE"]),
