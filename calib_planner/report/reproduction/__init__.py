@@ -1,0 +1,1 @@
+"""The paper's tables and figures, computed again: data first, drawing and page second."""
