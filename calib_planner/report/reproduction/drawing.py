@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from calib_planner.report.reproduction.calibrations import Calibrations
 from calib_planner.report.reproduction.figure_5 import Figure5
@@ -33,8 +34,8 @@ in_style = matplotlib.rc_context(STYLE)
 @in_style
 def draw_two_link_figure(result: TwoLinkFigure, *, narrow: bool = False) -> Figure:
     """Errors left at the test pose, a panel per plan on the same axes; circles have the radius ρ0."""
-    figure = Figure(figsize=(3.9, 11.6) if narrow else (9.6, 4.1), layout="constrained")
-    figure.get_layout_engine().set(h_pad=0.1)
+    layout = ConstrainedLayoutEngine(h_pad=0.1)
+    figure = Figure(figsize=(3.9, 11.6) if narrow else (9.6, 4.1), layout=layout)
     panels = figure.subplots(3, 1) if narrow else figure.subplots(1, 3, sharex=True, sharey=True)
     reach = 1e3 * max(max(np.abs(p.errors).max(), p.expected, p.simulated) for p in result.plans)
     reach = np.ceil(2.1 * reach) / 2

@@ -85,6 +85,6 @@ def number(value: float) -> str:
         return f"{value:#.3g}".rstrip(".")
     if value < 99_999.5:
         return f"{value:.0f}"
-    exponent = int(np.floor(np.log10(value)))
-    superscript = str(exponent).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{value / 10**exponent:.3g}·10{superscript}"
+    digits, exponent = f"{value:.2e}".split("e")
+    superscript = str(int(exponent)).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{float(digits):g}·10{superscript}"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from calib_planner._arrays import check_count
+from calib_planner.design.plan import plain
 from calib_planner.report.reproduction import printed
 from calib_planner.report.reproduction.figure_2 import FIGURE_2
 from calib_planner.report.reproduction.figure_3 import FIGURE_3
@@ -69,7 +70,7 @@ class Reproduction:
             "table_2": {
                 "robot": ROBOT,
                 "sigma": SIGMA,
-                "workspace": {"low": WORKSPACE.low.tolist(), "high": WORKSPACE.high.tolist()},  # type: ignore[union-attr]
+                "workspace": plain({"low": WORKSPACE.low, "high": WORKSPACE.high}),
                 "columns": [{"configurations": m, "repetitions": r} for m, r in printed.SIZES],
                 "printed": {row: list(values) for row, values in printed.TABLE_2.items()},
                 "printed_contradictions": [vars(d) for d in printed.contradictions()],

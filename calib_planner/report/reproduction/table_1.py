@@ -16,7 +16,7 @@ from calib_planner.design.planner import plan
 from calib_planner.design.problem import PlanProblem
 from calib_planner.report.reproduction import printed
 from calib_planner.report.reproduction.calibrations import error_covariance
-from calib_planner.report.reproduction.two_link import LENGTHS, bent, d_optimal_variance, least_variance, two_link
+from calib_planner.report.reproduction.two_link import LENGTHS, bent, least_variance, two_link
 
 CONFIGURATIONS = 2
 D_OPTIMAL = bent((-90.0, 90.0))
@@ -69,11 +69,6 @@ class Table1:
     """The columns, in the paper's order."""
 
     columns: tuple[Column, ...]
-
-    @property
-    def closed_form_d(self) -> float:
-        """ρ_D²/σ² by eq. (18) with S = 0."""
-        return d_optimal_variance(CONFIGURATIONS)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""

@@ -42,7 +42,7 @@ Rows = Mapping[str, tuple[float, ...]]
 
 
 @dataclass(frozen=True)
-class TestPose:
+class ChosenPose:
     """A test pose that was chosen here, and why.
 
     Attributes:
@@ -51,8 +51,6 @@ class TestPose:
         why: What it stands for.
         starts: Random starts of the search for it.
     """
-
-    __test__ = False  # no test class, whatever pytest may think of the name
 
     name: str
     degrees: tuple[float, ...]
@@ -66,9 +64,9 @@ class TestPose:
 
 
 TEST_POSES = (
-    TestPose("A", (0, -60, 90, 0, 45, 0), "arm leaning forward, forearm level, wrist bent, in mid-workspace"),
-    TestPose("B", (30, -45, 100, 0, -55, 0), "off to the side and lower, wrist bent the other way"),
-    TestPose("C", (10, -100, 60, 90, 90, 0), "above the workspace: it cannot be measured itself", 8),
+    ChosenPose("A", (0, -60, 90, 0, 45, 0), "arm leaning forward, forearm level, wrist bent, in mid-workspace"),
+    ChosenPose("B", (30, -45, 100, 0, -55, 0), "off to the side and lower, wrist bent the other way"),
+    ChosenPose("C", (10, -100, 60, 90, 90, 0), "above the workspace: it cannot be measured itself", 8),
 )
 
 
@@ -83,7 +81,7 @@ class Table2:
         random: m → (count,) ρ0 of random plans of m configurations [m], ascending.
     """
 
-    pose: TestPose
+    pose: ChosenPose
     inside: bool
     plans: dict[int, Plan]
     random: dict[int, FloatArray]
@@ -131,7 +129,7 @@ def scaled(rows: Rows) -> Rows:
     return {row: tuple(value / unit for value in values) for row, values in rows.items()}
 
 
-def table_2(pose: TestPose, random_plans: int, seed: int) -> Table2:
+def table_2(pose: ChosenPose, random_plans: int, seed: int) -> Table2:
     """Plan and draw for every number of configurations."""
     plans, random = {}, {}
     for m in SEPARATE:
@@ -143,7 +141,7 @@ def table_2(pose: TestPose, random_plans: int, seed: int) -> Table2:
     return Table2(pose, inside, plans, random)
 
 
-def kuka_problem(pose: TestPose, configurations: int, repetitions: int = 1, *, seed: int) -> PlanProblem:
+def kuka_problem(pose: ChosenPose, configurations: int, repetitions: int = 1, *, seed: int) -> PlanProblem:
     """What is asked of the planner for one column."""
     return PlanProblem(
         Robot.load(ROBOT),

@@ -1,10 +1,8 @@
-"""Section 5, the two-link arm: the paper's closed forms, eqs. (18)–(20).
+"""Section 5, the two-link arm. Its closed form (20), beside which the library's numbers stand, follows from
 
-For Π = (Δl1, Δl2) or (Δq1, Δq2), with S = Σ cos q2i over m configurations,
+    ρ0²/σ² = 2 (m − cos q20 · S) / (m² − S²),   S = Σ cos q2i                       (18)
 
-    ρ0²/σ² = 2 (m − cos q20 · S) / (m² − S²)                                        (18)
-    S*     = m (1 − |sin q20|) / cos q20,  0 where cos q20 = 0                      (19)
-    ρ0²/σ² = (1 + |sin q20|) / m  at S*;  2/m  at S = 0, the D-optimal plans        (20)
+for Π = (Δl1, Δl2) or (Δq1, Δq2): the slope in S is zero at S* = m (1 − |sin q20|) / cos q20, eq. (19).
 """
 
 from __future__ import annotations
@@ -28,17 +26,6 @@ def bent(degrees: tuple[float, ...]) -> FloatArray:
     return np.radians([[0.0, angle] for angle in degrees])
 
 
-def variance(q2: FloatArray, q20: float) -> float:
-    """ρ0²/σ² of eq. (18) for angles q2 (m,) and the test pose's q20 [rad]."""
-    m, s = len(q2), float(np.cos(q2).sum())
-    return float(2 * (m - np.cos(q20) * s) / (m**2 - s**2))
-
-
 def least_variance(m: int, q20: float) -> float:
     """ρ0²/σ² of eq. (20), the least that m measurements reach; q20 [rad]."""
     return float((1 + abs(np.sin(q20))) / m)
-
-
-def d_optimal_variance(m: int) -> float:
-    """ρ0²/σ² of D-optimal plans, S = 0 in eq. (18)."""
-    return 2 / m
