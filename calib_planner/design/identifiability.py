@@ -5,6 +5,9 @@ column that lies (to the tolerance) in the span of those already taken is not id
 held at its nominal value, and the combination that the data cannot see is named. Priority: base pose and
 target offsets first — without them no residual means anything — then the order of the request.
 
+Only the triangle R of the scaled columns (QR) is worked on: it has the same lengths, angles and combinations as
+the equations, and one row per parameter.
+
 What noise leaves of a parameter beside its predecessors is a standard deviation σ/‖column ⟂ predecessors‖. One
 that could be half a metre or a radian for all the data say is as unseen as one without any column.
 """
@@ -15,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from calib_planner._arrays import FloatArray
 
@@ -64,40 +68,52 @@ def analyse(
     """
     norms = np.linalg.norm(jacobian, axis=0)
     scale = np.where(norms > NO_LEVER * np.sqrt(len(jacobian)), norms, 0.0)
-    unit = np.divide(jacobian, scale, out=np.zeros_like(jacobian), where=scale > 0)
+    unit = np.divide(jacobian, scale, out=np.zeros(jacobian.shape), where=scale > 0)
+    if len(unit) > unit.shape[1]:
+        unit = np.linalg.qr(unit, mode="r")
     first = [i for i, n in enumerate(names) if n.startswith(("base.", "target_"))]
     order = first + [i for i in range(len(names)) if i not in first]
-    basis = np.empty((min(jacobian.shape), jacobian.shape[0]))
+    columns = np.ascontiguousarray(unit.T)
+    basis = np.empty((min(unit.shape), len(unit)))
+    triangle = np.zeros((len(basis), len(basis)))  # of the columns kept: their coordinates in the basis
     kept: list[int] = []
     held: list[int] = []
     directions: list[FloatArray] = []
     lengths: list[float] = []
     least = np.zeros(len(names)) if shortest is None else shortest
     for i in order:
-        rest = unit[:, i].copy()
-        for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
-            rest -= basis[: len(kept)].T @ (basis[: len(kept)] @ rest)
-        size = float(np.linalg.norm(rest))
+        known = basis[: len(kept)]
+        share = known @ columns[i]
+        rest = columns[i] - share @ known
+        again = known @ rest  # twice is enough (Kahan): orthogonal to rounding
+        share += again
+        rest -= again @ known
+        size = float(np.sqrt(rest @ rest))
         if size > tolerance and size * scale[i] > least[i] and len(kept) < len(basis):
+            triangle[: len(kept), len(kept)] = share
+            triangle[len(kept), len(kept)] = size
             basis[len(kept)] = rest / size
             kept.append(i)
             lengths.append(size * float(scale[i]))
         else:
             held.append(i)
-            directions.append(_direction(unit, scale, kept, i))
+            directions.append(_direction(triangle[: len(kept), : len(kept)], share, scale, kept, i))
     combinations = tuple(describe(d, names, first=i) for d, i in zip(directions, held, strict=True))
     matrix = np.array(directions).reshape(len(held), len(names))
     return Identifiability(tuple(kept), combinations, tuple(held), matrix, tuple(lengths))
 
 
-def _direction(unit: FloatArray, scale: FloatArray, kept: list[int], i: int) -> FloatArray:
-    """(P,) change of the parameters that no point shows: i by one, and what undoes it."""
+def _direction(triangle: FloatArray, share: FloatArray, scale: FloatArray, kept: list[int], i: int) -> FloatArray:
+    """(P,) change of the parameters that no point shows: i by one, and what undoes it.
+
+    ``triangle`` (kept, kept) and ``share`` (kept,) are the columns kept and column i in the orthonormal basis.
+    """
     direction = np.zeros(len(scale))
     direction[i] = 1.0
     if scale[i] > 0.0 and kept:
-        share = np.linalg.lstsq(unit[:, kept], unit[:, i], rcond=None)[0]
-        share[np.abs(share) <= SMALL] = 0.0
-        direction[kept] = -share * scale[i] / scale[kept]
+        weights = solve_triangular(triangle, share, check_finite=False)
+        weights[np.abs(weights) <= SMALL] = 0.0
+        direction[kept] = -weights * scale[i] / scale[kept]
     return direction
 
 

@@ -27,7 +27,10 @@ from calib_planner.robot.linearisation import Layout, Linearisation
 from calib_planner.robot.parameters import Parameter, resolve_parameters
 from calib_planner.robot.posture import Posture
 from calib_planner.robot.program import Program, compile_program
-from calib_planner.robot.tracing import structure_of
+from calib_planner.robot.tracing import codes_of, structure_of
+
+MOST_PROGRAMS = 64
+"""Programs that a robot remembers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,28 +262,35 @@ class Robot:
         return frozen(np.array([e.value for e in self._flat]))
 
     @cached_property
+    def _turning(self) -> NDArray[np.bool_]:
+        return np.array([e.is_rotation and e.joint is None for e in self._flat])
+
+    @cached_property
+    def _nominal_codes(self) -> NDArray[np.int8]:
+        return codes_of(self._nominal_amounts, self._turning)
+
+    @cached_property
     def _posture_program(self) -> Program:
         joints, trunk = self._layout.joint_elements, len(self.elements)
         # A target's branch begins with Tx, Ty, Tz from the tip: their axes are the tip's.
         axes, origins = (*joints, trunk, trunk + 1, trunk + 2), (*joints, trunk - 1)
-        amounts = self._nominal_amounts
-        return compile_program(structure_of(self.elements, self.targets, amounts, (), axes, origins))
+        codes = self._nominal_codes.tolist()
+        return compile_program(structure_of(self.elements, self.targets, codes, (), axes, origins))
 
     @cached_property
-    def _nominal_programs(self) -> dict[tuple[int, ...], Program]:
+    def _programs(self) -> dict[tuple[bytes, Sequence[int], Sequence[int]], Program]:
         return {}
 
     def _program(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
-        """The compiled chain; those of the nominal robot are remembered by what they compute."""
-        if amounts is self._nominal_amounts:
-            key = (*columns, -1, *axes)
-            if key not in self._nominal_programs:
-                self._nominal_programs[key] = self._compile(amounts, columns, axes)
-            return self._nominal_programs[key]
-        return self._compile(amounts, columns, axes)
-
-    def _compile(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
-        return compile_program(structure_of(self.elements, self.targets, amounts, columns, axes))
+        """The compiled chain: the amounts matter by their codes alone, and programs are remembered by them."""
+        codes = self._nominal_codes if amounts is self._nominal_amounts else codes_of(amounts, self._turning)
+        known, key = self._programs, (codes.tobytes(), columns, axes)
+        if key not in known:
+            if len(known) >= MOST_PROGRAMS:
+                known.pop(next(iter(known)))
+            structure = structure_of(self.elements, self.targets, codes.tolist(), columns, axes)
+            known[key] = compile_program(structure)
+        return known[key]
 
     def _amounts(self, deviations: NDArray[Any]) -> NDArray[Any]:
         if not deviations.any():

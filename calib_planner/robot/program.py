@@ -54,6 +54,7 @@ class Program:
         copies: ``(row, sign, slot)``: outputs that are (negated) copies; sign 0 means zero.
         slots: Number of operand slots; the first ``rows`` are the output rows themselves.
         registers: Which scratch register backs each slot beyond the rows and inputs.
+        scratch: Number of scratch registers.
         rows: Number of output rows: positions, columns, axes, origins, in that order.
         shape: ``(targets, columns, axes)``.
     """
@@ -66,6 +67,7 @@ class Program:
     copies: tuple[tuple[int, int, int], ...]
     slots: int
     registers: tuple[tuple[int, int], ...]
+    scratch: int
     rows: int
     shape: tuple[int, int, int]
 
@@ -88,7 +90,7 @@ class Program:
         for slot, node in self.constants:
             table[slot] = dtype.type(numbers[node])
         width = min(BLOCK, count)
-        scratch = np.empty((1 + max((r for _, r in self.registers), default=-1), width), dtype)
+        scratch = np.empty((self.scratch, width), dtype)
         angles, waves = np.empty((len(self.turns), width), dtype), np.empty((2, len(self.turns), width), dtype)
         for start in range(0, count, BLOCK):
             stop = min(start + BLOCK, count)
@@ -224,6 +226,7 @@ def _lay_out(traced: Trace) -> Program:
         copies=tuple(copies),
         slots=slots + 1,
         registers=tuple(registers),
+        scratch=used,
         rows=rows,
         shape=traced.shape,
     )

@@ -43,14 +43,14 @@ class Structure:
 def structure_of(
     trunk: Sequence[Element],
     branches: Sequence[Sequence[Element]],
-    amounts: NDArray[Any],
+    codes: Sequence[int],
     columns: Sequence[int],
     axes: Sequence[int],
     origins: Sequence[int] = (),
 ) -> Structure:
-    """Classify each constant amount (flat order) and describe the chain."""
+    """Describe the chain, given the code of each constant amount (flat order)."""
     elements = [*trunk, *(e for branch in branches for e in branch)]
-    coded = [(e.kind, e.joint, e.sign, _code(e, amount)) for e, amount in zip(elements, amounts, strict=True)]
+    coded = [(e.kind, e.joint, e.sign, code) for e, code in zip(elements, codes, strict=True)]
     split, start = [], len(trunk)
     for branch in branches:
         split.append(tuple(coded[start : start + len(branch)]))
@@ -59,14 +59,19 @@ def structure_of(
     return Structure(trunk_code, tuple(split), tuple(columns), tuple(axes), tuple(origins))
 
 
-def _code(element: Element, amount: complex) -> int:
-    if amount == 0:
-        return 0
-    if element.is_rotation and element.joint is None and np.isrealobj(amount):
-        turns = float(np.real(amount)) / (np.pi / 2)
-        if abs(turns - round(turns)) < 1e-15:
-            return round(turns) % 4
-    return GENERAL
+def codes_of(amounts: NDArray[Any], turning: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """Structure code of each constant amount.
+
+    Args:
+        amounts: (elements,) real or complex [rad | m].
+        turning: (elements,) whether each is a rotation without a joint.
+    """
+    if np.iscomplexobj(amounts):
+        return np.where(amounts == 0, 0, GENERAL).astype(np.int8)
+    turns = amounts / (np.pi / 2)
+    whole = np.rint(turns)
+    exact = turning & (np.abs(turns - whole) < 1e-15)
+    return np.where(amounts == 0, 0, np.where(exact, whole % 4, GENERAL)).astype(np.int8)
 
 
 # ── symbols ──────────────────────────────────────────────────────────────────────────────────────────
