@@ -7,12 +7,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from calib_planner._arrays import FloatArray, frozen
+from calib_planner._arrays import FloatArray, check_configurations, frozen
 from calib_planner.design.plan import plain
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.structure import Structure
+from calib_planner.identification.transmission import Transmission
 from calib_planner.identification.verdict import Verdict, judge
 from calib_planner.robot.chain import Robot
 
@@ -55,6 +57,7 @@ class Validation:
         predicted_rms: What the covariance, the discrepancy and the measurement noise together predict for rms;
             NaN where it was not predicted.
         within_95: Share of the points inside their 95 % region; NaN where it was not predicted.
+        geometry_mean, geometry_rms: With the geometric parameters alone, without joint corrections.
         folds: Parts of a cross-validation; 0: held-out data.
     """
 
@@ -66,6 +69,8 @@ class Validation:
     before_mean: float
     predicted_rms: float = float("nan")
     within_95: float = float("nan")
+    geometry_mean: float = float("nan")
+    geometry_rms: float = float("nan")
     folds: int = 0
 
 
@@ -126,6 +131,7 @@ class Estimate:
         parameter_accuracy_per_test_pose: (K,) ρ0 of eq. (14) with the covariance found [m].
         discrepancy_per_test_pose: (K,) what no geometric model holds there, root mean square distance [m].
         structure: Whether the residuals know where the robot stood; see ``structure``.
+        transmission: The complete model with the joints' own errors, if the data show them; else ``None``.
         starts, agreeing_starts: Other starts made, and those that ended in the same minimum.
         iterations: Iterations of the last fit.
         status: A key of ``STATUS``.
@@ -168,6 +174,7 @@ class Estimate:
     parameter_accuracy_per_test_pose: FloatArray
     discrepancy_per_test_pose: FloatArray
     structure: tuple[Structure, ...]
+    transmission: Transmission | None
     starts: int
     agreeing_starts: int
     iterations: int
@@ -189,10 +196,24 @@ class Estimate:
         """(P,) nominal + deviation [m | rad]."""
         return self.nominal + self.deviations
 
+    def positions(self, q: ArrayLike) -> FloatArray:
+        """Where the targets are, with all that was learnt: (N, joints) → (N, targets, 3) [m]."""
+        clean = check_configurations("configurations", q, self.joint_names)
+        return (self.transmission or self.calibrated).positions(clean)
+
     @property
-    def predicted_accuracy_per_test_pose(self) -> FloatArray:
-        """(K,) root mean square error expected: uncertainty of the parameters, eq. (14), and discrepancy [m]."""
+    def geometry_accuracy_per_test_pose(self) -> FloatArray:
+        """(K,) root mean square error expected of ``calibrated``: uncertainty, eq. (14), and discrepancy [m]."""
         return np.hypot(self.parameter_accuracy_per_test_pose, self.discrepancy_per_test_pose)
+
+    @cached_property
+    def predicted_accuracy_per_test_pose(self) -> FloatArray:
+        """(K,) root mean square error expected of ``positions`` [m]."""
+        if self.transmission is None or not len(self.test_poses):
+            return self.geometry_accuracy_per_test_pose
+        blind = np.isinf(self.parameter_accuracy_per_test_pose)
+        squares = np.einsum("ktii->kt", self.transmission.error_covariance(self.test_poses)).mean(axis=1)
+        return np.where(blind, np.inf, np.sqrt(squares))
 
     @property
     def predicted_accuracy(self) -> float:
@@ -254,6 +275,7 @@ class Estimate:
             "residuals": self.residuals,
             "normalised_residuals": self.normalised_residuals,
             "structure": [asdict(s) for s in self.structure],
+            "joint_corrections": None if self.transmission is None else self.transmission.to_dict(),
             "starts": self.starts,
             "agreeing_starts": self.agreeing_starts,
             "iterations": self.iterations,
@@ -266,6 +288,7 @@ class Estimate:
             result["test_poses"] = self.test_poses
             result["predicted_accuracy"] = self.predicted_accuracy
             result["predicted_accuracy_per_test_pose"] = self.predicted_accuracy_per_test_pose
+            result["geometry_accuracy_per_test_pose"] = self.geometry_accuracy_per_test_pose
             result["parameter_accuracy_per_test_pose"] = self.parameter_accuracy_per_test_pose
             result["discrepancy_per_test_pose"] = self.discrepancy_per_test_pose
         for name in ("validation", "cross_validation"):

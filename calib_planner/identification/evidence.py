@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray, IntArray
+from calib_planner._arrays import FloatArray
 from calib_planner.design.identifiability import Identifiability, describe
 from calib_planner.identification.equations import Equations, point_whitening
 from calib_planner.identification.estimate import (
@@ -21,8 +21,9 @@ from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
-from calib_planner.identification.structure import residual_structure
+from calib_planner.identification.structure import Structure
 from calib_planner.identification.suspicions import explain
+from calib_planner.identification.transmission import Transmission
 from calib_planner.robot.chain import Robot
 
 BLIND = 1e-5
@@ -48,7 +49,8 @@ class Evidence:
     freedom: int
     normalised: FloatArray
     gate: float
-    labels: IntArray
+    structure: tuple[Structure, ...]
+    transmission: Transmission | None
     jacobian: FloatArray
     starts: int
     agreeing: int
@@ -107,7 +109,8 @@ def estimate_of(evidence: Evidence) -> Estimate:
         test_poses=poses,
         parameter_accuracy_per_test_pose=precision,
         discrepancy_per_test_pose=discrepancy,
-        structure=residual_structure(robot, data.q, residuals, use, evidence.labels),
+        structure=evidence.structure,
+        transmission=evidence.transmission,
         starts=evidence.starts,
         agreeing_starts=evidence.agreeing,
         iterations=fit.iterations,

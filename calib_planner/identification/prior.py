@@ -21,7 +21,7 @@ LENGTH_STD = 5e-4
 """How far lengths of an assembled industrial robot typically are from the data sheet [m]."""
 ANGLE_STD = 1e-3
 """The same for angles between axes [rad]."""
-OFFSET_STD = 0.05
+OFFSET_STD = 0.02
 """The same for the zeros of joints, which are set by hand, in any unit [rad | m]."""
 
 

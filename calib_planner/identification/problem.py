@@ -15,7 +15,7 @@ from calib_planner.instrument.noise import Noise
 from calib_planner.robot.chain import Robot
 
 LOSSES = ("linear", "robust")
-DISCREPANCY = ("auto", "off")
+AUTOMATIC = ("auto", "off")
 UNKNOWN_SIGMA = 1e-4
 """Standard deviation of one coordinate that stands in until the residuals have told it [m]."""
 
@@ -39,6 +39,8 @@ class IdentificationProblem:
         instrument: The tracker's noise by direction, in the frame of the points; ``None``: see ``sigma``.
         discrepancy: ``auto``: residuals that measurement noise does not explain are a model discrepancy, which
             is estimated, weighs the points and adds to every predicted accuracy; ``off``: they are not.
+        joint_corrections: ``auto``: if the residuals know where the robot stood, errors of the joints'
+            transmissions are looked for and, where the data show them, learnt; ``off``: they are not.
         starts: Other starts that must end in the same minimum.
         required_accuracy: Largest error at a pose that the user can live with [m], for the verdict.
     """
@@ -52,6 +54,7 @@ class IdentificationProblem:
     prior: Prior | None = None
     instrument: Noise | None = None
     discrepancy: str = "auto"
+    joint_corrections: str = "auto"
     starts: int = 2
     required_accuracy: float | None = None
 
@@ -72,8 +75,9 @@ class IdentificationProblem:
             put(self, "sigma", check_number("sigma", self.sigma, low=0, low_open=True, unit="m"))
         if self.loss not in LOSSES:
             raise UnknownNameError("loss", str(self.loss), LOSSES)
-        if self.discrepancy not in DISCREPANCY:
-            raise UnknownNameError("discrepancy", str(self.discrepancy), DISCREPANCY)
+        for name in ("discrepancy", "joint_corrections"):
+            if getattr(self, name) not in AUTOMATIC:
+                raise UnknownNameError(name, str(getattr(self, name)), AUTOMATIC)
         if self.sigma is not None and self.instrument is not None:
             raise InputError("sigma", "a sigma and an instrument", "one of the two")
         if self.test_poses is not None:

@@ -43,7 +43,9 @@ from calib_planner.identification.robust import (
     robust_registration,
     select,
 )
+from calib_planner.identification.structure import SIGNIFICANT, Structure, residual_structure
 from calib_planner.identification.suspicions import check_units
+from calib_planner.identification.transmission import Transmission, fit_transmission
 from calib_planner.robot.chain import Robot
 
 MOST_GATES = 12
@@ -52,6 +54,8 @@ FIRST_ITERATIONS = 3
 """Iterations of the fit that tells how much the points scatter, roughly."""
 UNSEEN = 0.05
 """A parameter that the data leave this uncertain is not identified by them [m | rad]."""
+TINY = 1e-6
+"""Share of the stand-in covariance that keeps matrices regular where the noise is estimated anew."""
 START_LENGTH = 5e-3
 """Standard deviation of the lengths of other starts [m]."""
 START_ANGLE = 2e-2
@@ -78,6 +82,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
     work, first = _without_unseen(_Work.of(problem, robot), seen, start)
     found = _robust(work, first) if problem.loss == "robust" else _solve(work, seen, first)
     found, starts, agreeing = _other_starts(work, found)
+    structure = _structure(work, found)
     evidence = Evidence(
         problem=problem,
         robot=robot,
@@ -92,8 +97,9 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         freedom=found.freedom,
         normalised=_normalised(work, found),
         gate=_gate(found),
-        labels=work.labels,
         jacobian=work.jacobian,
+        structure=structure,
+        transmission=_transmission(work, found, structure),
         starts=starts,
         agreeing=agreeing,
         seconds=time.perf_counter() - began,
@@ -364,3 +370,23 @@ def _other_starts(work: _Work, found: _Found) -> tuple[_Found, int, int]:
             best, agreeing = other, 0
         agreeing += int(abs(other.cost - best.cost) <= close)
     return replace(found, fit=best), work.problem.starts, agreeing
+
+
+# ── do the residuals know where the robot stood? ─────────────────────────────────────────────────────
+
+
+def _structure(work: _Work, found: _Found) -> tuple[Structure, ...]:
+    data, use = work.problem.data, found.equations.use
+    residuals = data.p - work.robot.positions(data.q, found.fit.deviations)
+    return residual_structure(work.robot, data.q, residuals, use, work.labels)
+
+
+def _transmission(work: _Work, found: _Found, structure: tuple[Structure, ...]) -> Transmission | None:
+    """Errors of the joints' transmissions, if there is reason to look for them."""
+    reason = found.levels.discrepancy > 0 or any(s.probability < SIGNIFICANT for s in structure)
+    if work.problem.joint_corrections == "off" or not reason or not found.fit.converged:
+        return None
+    # Where the instrument's noise is unknown it is part of the white noise that is estimated there.
+    unknown = found.levels.source == "residuals"
+    instrument = TINY * work.instrument if unknown else found.levels.scaled**2 * work.instrument
+    return fit_transmission(found.equations, found.fit.deviations, found.fit.kept, instrument, work.labels)

@@ -1,9 +1,11 @@
 """Do the residuals know where the robot stood? Then something is missing from the model.
 
-After a good fit residuals are independent. Two questions, each with an answer that is normal if they are:
+After a good fit residuals are independent. Three questions, each with an answer that is normal if they are:
 
 *Neighbours.* With each configuration's nearest other in joint space, S = Σ w_ij r_i·r_j; its variance is
 Σ_{i<j} (w_ij + w_ji)² tr(C²), C the second moment of r (Moran 1950, for vectors).
+
+*One configuration.* Its targets' residuals: S = Σ r_t·r_u over pairs, of variance (pairs) tr(C²).
 
 *One joint.* The part of r_i along c_l = ∂p/∂q_l, in order of q_l: neighbours in one joint's angle that err alike
 mean an error of that joint's transmission. S = Σ y_i y_{i+1}, of variance (n − 1) (Σ y²/n)².
@@ -22,6 +24,8 @@ from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.identification.discrepancy import joint_features
 from calib_planner.robot.chain import Robot
 
+SIGNIFICANT = 1e-4
+"""A structure less probable than this by chance is one."""
 FEWEST = 10
 """Configurations below which nothing can be seen."""
 
@@ -31,13 +35,15 @@ class Structure:
     """One answer.
 
     Attributes:
-        joint: Name of the joint; empty for neighbours in joint space.
+        kind: ``neighbours`` in joint space, ``configuration`` or ``joint``.
+        joint: Name of the joint; empty for the other kinds.
         correlation: Of neighbours, 0 if independent.
         probability: Of a correlation as large, by chance.
-        amplitude: Root mean square of the joint's apparent error [rad | m]; of the residuals [m] for neighbours.
+        amplitude: Root mean square of the joint's apparent error [rad | m]; of the residuals [m] for other kinds.
         unit: Of ``amplitude``.
     """
 
+    kind: str
     joint: str
     correlation: float
     probability: float
@@ -71,7 +77,8 @@ def residual_structure(
     levers = robot.joint_jacobian(q).reshape(*mean.shape, -1) * (count > 0)[..., None]
     joints = (_one_joint(robot, k, q[:, k], mean, levers[..., k]) for k in range(q.shape[1]))
     points = mean.sum(axis=1) / np.maximum((count > 0).sum(axis=1), 1)
-    return (_neighbours(robot, q, points), *(s for s in joints if s is not None))
+    found = (_neighbours(robot, q, points), _configuration(mean, count[..., 0] > 0), *joints)
+    return tuple(s for s in found if s is not None)
 
 
 def _neighbours(robot: Robot, q: FloatArray, r: FloatArray) -> Structure:
@@ -87,7 +94,21 @@ def _neighbours(robot: Robot, q: FloatArray, r: FloatArray) -> Structure:
     z = statistic / deviation if deviation > 0 else 0.0
     size = float(np.trace(moment))
     correlation = statistic / (n * size) if size > 0 else 0.0
-    return Structure("", correlation, float(norm.sf(z)), float(np.sqrt(size)), "m")
+    return Structure("neighbours", "", correlation, float(norm.sf(z)), float(np.sqrt(size)), "m")
+
+
+def _configuration(r: FloatArray, seen: NDArray[np.bool_]) -> Structure | None:
+    pairs = int(np.sum(seen.sum(axis=1) * (seen.sum(axis=1) - 1)) // 2)
+    moment = np.einsum("nta,ntb->ab", r, r) / seen.sum()
+    size = float(np.trace(moment))
+    if not pairs or size == 0.0:
+        return None
+    total = r.sum(axis=1)
+    statistic = 0.5 * float(np.sum(total**2) - np.sum(r**2))
+    z = statistic / np.sqrt(pairs * float(np.sum(moment**2)))
+    return Structure(
+        "configuration", "", statistic / (pairs * size), float(norm.sf(z)), float(np.sqrt(size)), "m"
+    )
 
 
 def _one_joint(robot: Robot, k: int, angle: FloatArray, r: FloatArray, lever: FloatArray) -> Structure | None:
@@ -104,4 +125,4 @@ def _one_joint(robot: Robot, k: int, angle: FloatArray, r: FloatArray, lever: Fl
     probability = float(norm.sf(correlation * np.sqrt(len(y) - 1)))
     amplitude = float(np.sqrt(square / np.mean(length**2)))
     unit = "rad" if robot.joint_is_revolute[k] else "m"
-    return Structure(robot.joint_names[k], correlation, probability, amplitude, unit)
+    return Structure("joint", robot.joint_names[k], correlation, probability, amplitude, unit)

@@ -21,8 +21,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from calib_planner._arrays import FloatArray, check_count
@@ -30,12 +32,13 @@ from calib_planner.errors import InputError, NotEnoughDataError
 from calib_planner.identification.discrepancy import Discrepancy, fit_discrepancy
 from calib_planner.identification.equations import configuration_labels
 from calib_planner.identification.estimate import Estimate, Validation
-from calib_planner.identification.evidence import distances, fit_placement
+from calib_planner.identification.evidence import fit_placement
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
 from calib_planner.identification.robust import normalised
 from calib_planner.identification.solver import identify, start_robot
+from calib_planner.identification.transmission import Transmission
 from calib_planner.robot.chain import Robot
 
 INSIDE = float(np.sqrt(chi2.ppf(0.95, 3)))
@@ -59,9 +62,10 @@ def validate(
     """
     if target_from < 0:
         raise InputError("validate_target_from", target_from, "a whole number >= 0")
-    before_robot = _before(problem)
-    discrepancy = _discrepancy(problem, estimate) if target_from else None
-    after, before = [], []
+    models = _models(estimate)
+    before = _Geometry(_before(problem), estimate)
+    discrepancy = _discrepancy(problem, estimate) if target_from and estimate.transmission is None else None
+    found: list[list[_Prediction]] = []
     for data in (d.in_order_of(problem.robot.joint_names) for d in held_out):
         if len(data) <= target_from:
             raise NotEnoughDataError(
@@ -71,9 +75,10 @@ def validate(
                 "which give the target: nothing is left to test",
             )
         seat, rest = data.select(np.arange(target_from)), data.select(np.arange(target_from, len(data)))
-        after.append(_predict(estimate, estimate.calibrated, seat, rest, discrepancy))
-        before.append(_predict(estimate, before_robot, seat, rest, None))
-    return replace(estimate, validation=_statistics(after, before))
+        expected = np.zeros((len(seat), 3)) if discrepancy is None else discrepancy.predict(seat.q)
+        cleaned = Measurements(seat.joint_names, seat.q, seat.p - expected[:, None], seat.std)
+        found.append([*(_predict(m, cleaned, rest) for m in models), _predict(before, seat, rest)])
+    return replace(estimate, validation=_statistics(found))
 
 
 def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: int = 5, seed: int = 0) -> Estimate:
@@ -92,106 +97,190 @@ def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: in
     check_count("folds", folds, low=2, high=count)
     fold = np.random.default_rng(seed).permutation(np.arange(count) % folds)[labels]
     used = _without(problem.data, estimate)
-    after, before = [], []
+    again = "off" if estimate.transmission is None else "auto"
+    parts: list[list[_Prediction]] = []
     for k in range(folds):
-        part = replace(problem, data=problem.data.select(np.flatnonzero(fold != k)), test_poses=None, starts=0)
+        rows = problem.data.select(np.flatnonzero(fold != k))
+        part = replace(problem, data=rows, test_poses=None, starts=0, joint_corrections=again)
         found = identify(part, start=estimate)
         rest = used.select(np.flatnonzero(fold == k))
-        none = rest.select(np.arange(0))
-        after.append(_predict(found, found.calibrated, none, rest, None))
-        before.append(_predict(found, _before(part), none, rest, None))
-    return replace(estimate, cross_validation=replace(_statistics(after, before), folds=folds))
+        models = (*_models(found), _Geometry(_before(part), found))
+        parts.append([_predict(m, rest.select(np.arange(0)), rest) for m in models])
+    return replace(estimate, cross_validation=replace(_statistics(parts), folds=folds))
 
 
 # ── predictions of one set ───────────────────────────────────────────────────────────────────────────
 
 
+class _Model(Protocol):
+    """What predicts, and how far off it expects to be."""
+
+    @property
+    def estimate(self) -> Estimate: ...
+
+    @property
+    def robot(self) -> Robot: ...
+
+    def actual(self, q: FloatArray) -> FloatArray:
+        """Joint values at which ``robot`` is right."""
+        ...
+
+    def with_targets(self, xyz: FloatArray) -> _Model: ...
+
+    def columns(self, q: FloatArray) -> FloatArray:
+        """(N, targets, 3, K) ∂p/∂(all that is uncertain)."""
+        ...
+
+    def covariance(self) -> FloatArray:
+        """(K, K) of what is uncertain."""
+        ...
+
+    def discrepancy(self, q: FloatArray) -> FloatArray:
+        """(N, targets, 3, 3) of what the model does not hold [m²]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Geometry:
+    """Geometric parameters alone."""
+
+    robot: Robot
+    estimate: Estimate
+
+    def actual(self, q: FloatArray) -> FloatArray:
+        return q
+
+    def with_targets(self, xyz: FloatArray) -> _Geometry:
+        return replace(self, robot=self.robot.with_targets(xyz))
+
+    def columns(self, q: FloatArray) -> FloatArray:
+        return np.ascontiguousarray(self.robot.jacobian(q)).reshape(len(q), len(self.robot.targets), 3, -1)
+
+    def covariance(self) -> FloatArray:
+        own = [self.estimate.parameters.index(n) for n in self.robot.parameter_names]
+        return self.estimate.covariance[np.ix_(own, own)]
+
+    def discrepancy(self, q: FloatArray) -> FloatArray:
+        return self.estimate.noise.discrepancy_covariance(self.robot, q)
+
+
+@dataclass(frozen=True, eq=False)
+class _Complete:
+    """Geometry and joint corrections."""
+
+    transmission: Transmission
+    estimate: Estimate
+
+    @property
+    def robot(self) -> Robot:
+        return self.transmission.robot
+
+    def actual(self, q: FloatArray) -> FloatArray:
+        return self.transmission.corrections.actual(q)
+
+    def with_targets(self, xyz: FloatArray) -> _Complete:
+        return replace(self, transmission=self.transmission.with_targets(xyz))
+
+    def columns(self, q: FloatArray) -> FloatArray:
+        return self.transmission.columns(q)
+
+    def covariance(self) -> FloatArray:
+        return self.transmission.covariance
+
+    def discrepancy(self, q: FloatArray) -> FloatArray:
+        return self.transmission.remainder(q)
+
+
+def _models(estimate: Estimate) -> tuple[_Model, ...]:
+    """The best model of the estimate, then its geometry alone."""
+    geometry = _Geometry(estimate.calibrated, estimate)
+    if estimate.transmission is None:
+        return geometry, geometry
+    return _Complete(estimate.transmission, estimate), geometry
+
+
 @dataclass(frozen=True, eq=False)
 class _Prediction:
-    """(N, targets, 3) measured − predicted and (N, targets, 3, 3) what it should scatter like."""
+    """(points, 3) measured − predicted and (points, 3, 3) what it should scatter like."""
 
     residuals: FloatArray
     covariance: FloatArray
 
 
-def _predict(
-    estimate: Estimate, robot: Robot, seat: Measurements, rest: Measurements, discrepancy: Discrepancy | None
-) -> _Prediction:
-    """``robot`` against ``rest``, its target from ``seat`` if that has rows."""
+def _predict(model: _Model, seat: Measurements, rest: Measurements) -> _Prediction:
+    """``model`` against ``rest``, its target from ``seat`` if that has rows."""
     targets = rest.p.shape[1]
+    robot = model.robot
     if len(seat):
-        if discrepancy is not None:
-            seat = Measurements(seat.joint_names, seat.q, seat.p - discrepancy.predict(seat.q)[:, None], seat.std)
-        robot = register(robot.with_targets(np.zeros((targets, 3))), seat, base=False, tool=True)
+        there = Measurements(seat.joint_names, model.actual(seat.q), seat.p, seat.std)
+        robot = register(robot.with_targets(np.zeros((targets, 3))), there, base=False, tool=True)
     elif len(robot.targets) < targets:
         raise InputError("validation data", f"{targets} targets", f"at most {len(robot.targets)} targets")
-    else:
-        robot = robot.with_targets(robot.target_offsets[:targets])
-    own = [estimate.parameters.index(n) for n in robot.parameter_names]
-    parameters = estimate.covariance[np.ix_(own, own)]
-    points, jacobian = robot.positions_and_jacobian(rest.q)
-    blocks = np.ascontiguousarray(jacobian).reshape(*points.shape, -1)
-    error = _noise(estimate, robot, rest)
+    model = model.with_targets(robot.target_offsets[:targets])
+    columns, error = model.columns(rest.q), _noise(model, rest)
     if len(seat):
-        blocks, error = _with_seat(estimate, robot, seat, rest, blocks, error)
-    return _Prediction(rest.p - points, blocks @ parameters @ np.swapaxes(blocks, 2, 3) + error)
+        columns, error = _with_seat(model, seat, rest, columns, error)
+    points = model.robot.positions(model.actual(rest.q))
+    covariance = columns @ model.covariance() @ np.swapaxes(columns, 2, 3) + error
+    return _Prediction((rest.p - points)[rest.seen], covariance[rest.seen])
 
 
 def _with_seat(
-    estimate: Estimate,
-    robot: Robot,
-    seat: Measurements,
-    rest: Measurements,
-    blocks: FloatArray,
-    error: FloatArray,
+    model: _Model, seat: Measurements, rest: Measurements, columns: FloatArray, error: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """J − J_t G J₀ and the covariance of e − J_t G e₀, target by target."""
-    names = [f"target_{t + 1}.{a}" for t in range(len(robot.targets)) for a in "xyz"]
-    moved = replace(robot, parameter_names=(*names,))
-    kinematic = robot.jacobian(seat.q).reshape(len(seat), len(robot.targets), 3, -1)
-    at_seat = moved.jacobian(seat.q).reshape(len(seat), len(robot.targets), 3, -1)
-    at_rest = moved.jacobian(rest.q).reshape(len(rest), len(robot.targets), 3, -1)
-    noise = _noise(estimate, robot, seat)
-    effective, total = blocks.copy(), error.copy()
-    for t in range(len(robot.targets)):
+    targets = len(model.robot.targets)
+    names = tuple(f"target_{t + 1}.{a}" for t in range(targets) for a in "xyz")
+    moved = replace(model.robot, parameter_names=names)
+    at_seat = moved.jacobian(model.actual(seat.q)).reshape(len(seat), targets, 3, -1)
+    at_rest = moved.jacobian(model.actual(rest.q)).reshape(len(rest), targets, 3, -1)
+    known, noise = model.columns(seat.q), _noise(model, seat)
+    effective, total = columns.copy(), error.copy()
+    for t in range(targets):
         rows = np.flatnonzero(seat.seen[:, t])
         own = slice(3 * t, 3 * t + 3)
-        inverse = np.linalg.pinv(at_seat[rows, t, :, own].reshape(-1, 3))
-        lever = at_rest[:, t, :, own] @ inverse
-        effective[:, t] -= lever @ kinematic[rows, t].reshape(-1, blocks.shape[-1])
-        scatter = np.zeros((3 * len(rows),) * 2)
-        for k, i in enumerate(rows):
-            scatter[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = noise[i, t]
+        lever = at_rest[:, t, :, own] @ np.linalg.pinv(at_seat[rows, t, :, own].reshape(-1, 3))
+        effective[:, t] -= lever @ known[rows, t].reshape(-1, columns.shape[-1])
+        scatter = block_diag(*noise[rows, t])
         total[:, t] += lever @ scatter @ np.swapaxes(lever, 1, 2)
     return effective, total
 
 
-def _noise(estimate: Estimate, robot: Robot, data: Measurements) -> FloatArray:
+def _noise(model: _Model, data: Measurements) -> FloatArray:
     """D + R of each point: (N, targets, 3, 3) [m²]."""
-    measured = np.full(data.p.shape, estimate.noise.measurement)
-    if data.std is not None and estimate.noise.source == "data":
-        measured = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0) * estimate.noise.scaled
-    return estimate.noise.discrepancy_covariance(robot, data.q) + measured[..., None] ** 2 * np.eye(3)
+    levels = model.estimate.noise
+    measured = np.full(data.p.shape, 0.0 if levels.source == "residuals" else levels.measurement)
+    if levels.source == "residuals" and model.estimate.transmission is None:
+        measured = np.full(data.p.shape, levels.measurement)
+    if data.std is not None and levels.source == "data":
+        measured = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0) * levels.scaled
+    return model.discrepancy(data.q) + measured[..., None] ** 2 * np.eye(3)
 
 
-def _statistics(after: list[_Prediction], before: list[_Prediction]) -> Validation:
-    residuals = np.concatenate([p.residuals.reshape(-1, 3) for p in after])
-    covariance = np.concatenate([p.covariance.reshape(-1, 3, 3) for p in after])
-    seen = np.isfinite(residuals[:, 0])
-    length = distances(residuals)
-    if not len(length):
+def _statistics(parts: list[list[_Prediction]]) -> Validation:
+    """Of the sets' predictions by the best model, by geometry alone, and before."""
+
+    def lengths(k: int) -> FloatArray:
+        return np.concatenate([np.linalg.norm(p[k].residuals, axis=1) for p in parts])
+
+    residuals = np.concatenate([p[0].residuals for p in parts])
+    covariance = np.concatenate([p[0].covariance for p in parts])
+    best, geometry, before = (lengths(k) for k in range(3))
+    if not len(best):
         raise NotEnoughDataError(0, 1, "the validation data hold no measured point")
-    known = bool(np.isfinite(covariance[seen]).all())
-    inside = normalised(residuals[seen], covariance[seen]) <= INSIDE if known else np.array([np.nan])
+    known = bool(np.isfinite(covariance).all())
+    inside = normalised(residuals, covariance) <= INSIDE if known else np.array([np.nan])
     return Validation(
-        count=len(length),
-        mean=float(length.mean()),
-        median=float(np.median(length)),
-        rms=float(np.sqrt(np.mean(length**2))),
-        max=float(length.max()),
-        before_mean=float(np.mean(np.concatenate([distances(p.residuals) for p in before]))),
-        predicted_rms=float(np.sqrt(np.mean(np.einsum("kii->k", covariance[seen])))),
+        count=len(best),
+        mean=float(best.mean()),
+        median=float(np.median(best)),
+        rms=float(np.sqrt(np.mean(best**2))),
+        max=float(best.max()),
+        before_mean=float(before.mean()),
+        predicted_rms=float(np.sqrt(np.mean(np.einsum("kii->k", covariance)))),
         within_95=float(np.mean(inside)),
+        geometry_mean=float(geometry.mean()),
+        geometry_rms=float(np.sqrt(np.mean(geometry**2))),
     )
 
 

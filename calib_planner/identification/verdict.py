@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib_planner.identification.structure import SIGNIFICANT
+
 if TYPE_CHECKING:
     from calib_planner.identification.estimate import Estimate, Validation
 
@@ -25,8 +27,6 @@ REJECTED = (0.05, 0.20)
 """Shares of rejected points that deserve a warning, and distrust."""
 APART = (1.5, 3.0)
 """Achieved over predicted error that deserves a warning, and distrust."""
-SIGNIFICANT = 1e-4
-"""A structure in the residuals less probable than this by chance is one."""
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,25 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
 
 
 def _structure(e: Estimate) -> Iterator[Reason]:
+    if e.transmission is not None:
+        found = e.transmission
+        text = (
+            f"the joints' transmissions err by {1e3 * found.amplitude:.2g} mrad with a length of {found.length:g} rad: "
+            "joint corrections were learnt and are part of every prediction"
+        )
+        advice = "a URDF cannot hold them: apply them to the joint targets (calib-planner compensate)"
+        yield Reason("PASS", "joint_corrections", text, advice)
     for found in (s for s in e.structure if s.probability < SIGNIFICANT):
-        level = "PASS" if e.noise.discrepancy > 0 else "WARN"
+        level = "PASS" if e.noise.discrepancy > 0 or e.transmission is not None else "WARN"
         if found.joint:
             size = f"{1e3 * found.amplitude:.2g} {'mrad' if found.unit == 'rad' else 'mm'}"
             text = (
                 f"errors of {found.joint} depend on where it stands, {size} (correlation {found.correlation:.2f})"
             )
             advice = "gear, encoder or compliance: no geometric parameter removes it"
+        elif found.kind == "configuration":
+            text = f"the targets of one configuration err alike (correlation {found.correlation:.2f})"
+            advice = "what is left is the robot's, not the tracker's: measuring a point again does not reduce it"
         else:
             text = f"neighbouring configurations err alike (correlation {found.correlation:.2f})"
             advice = (
