@@ -134,11 +134,8 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
 
 def _structure(e: Estimate) -> Iterator[Reason]:
     if e.transmission is not None:
-        found = e.transmission
-        text = (
-            f"the joints' transmissions err by {1e3 * found.amplitude:.2g} mrad with a length of {found.length:g} rad: "
-            "joint corrections were learnt and are part of every prediction"
-        )
+        size = f"{1e3 * e.transmission.amplitude:.2g} mrad, alike over {e.transmission.length:g} rad"
+        text = f"the joints' transmissions err ({size}): corrections were learnt and are part of every prediction"
         advice = "a URDF cannot hold them: apply them to the joint targets (calib-planner compensate)"
         yield Reason("PASS", "joint_corrections", text, advice)
     for found in (s for s in e.structure if s.probability < SIGNIFICANT):

@@ -5,7 +5,8 @@ real, calibrated robot has it at T_cal(q). ``compensate`` finds angles q′ near
 
     T_cal(q′) = T_nom(q),
 
-so that a controller told q′ has the real tool where the plan, made with the nominal model, says. Both poses are
+so that a controller told q′ has the real tool where the plan, made with the nominal model, says. If the joints
+turn by φ(q) beyond what they read, the angles found are those they must be at, and q′ is what they must read. Both poses are
 in the robot's own base frame: where the base stands before the tracker plays no part. The pose is that of the
 tip's frame; ``position_only`` asks for one point only (a target: where it is on the nominal robot, and where it
 was found to be on the calibrated one). That is the right question if the orientation does not matter, if the
@@ -25,6 +26,7 @@ from calib_planner._arrays import FloatArray, check_configurations, check_number
 from calib_planner.errors import InputError
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.inverse import Goals, goals_of, residuals, solve
+from calib_planner.robot.joint_corrections import JointCorrections
 
 POSITION_TOLERANCE = 1e-9
 """A remaining position error [m] up to which a target counts as reached."""
@@ -102,6 +104,7 @@ def compensate(
     target: int = 0,
     limits: bool = True,
     lever: float = LEVER,
+    corrections: JointCorrections | None = None,
 ) -> Compensation:
     """Correct joint targets for the difference between the two robots.
 
@@ -114,6 +117,7 @@ def compensate(
         limits: Stay within the nominal robot's joint limits. A joint with limits of exactly ±π is
             taken for a continuous one, without any.
         lever: What a radian counts beside a metre where not both can be had [m].
+        corrections: What the joints do beyond what they read, as learnt together with ``calibrated``.
 
     Raises:
         InputError: Other joints, wrong shape, no such target, or a lever that is not positive.
@@ -129,7 +133,11 @@ def compensate(
     goals = replace(goals_of(nominal, q, here, position_only, lever), point=there)
     low, high = _bounds(nominal, q, limits)
     corrected = solve(calibrated, goals, q, low, high)
-    after, before = _errors(calibrated, goals, corrected), _errors(calibrated, goals, q)
+    actual, uncorrected = corrected, q
+    if corrections is not None:
+        corrected = np.clip(corrections.reading(corrected), low, high)
+        actual, uncorrected = corrections.actual(corrected), corrections.actual(q)
+    after, before = _errors(calibrated, goals, actual), _errors(calibrated, goals, uncorrected)
     return Compensation(
         joint_names=nominal.joint_names,
         targets=q,

@@ -183,7 +183,9 @@ class Campaign:
         try:
             if data is None:
                 raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-            return identify(IdentificationProblem(self.robot, data, test_poses=poses))
+            # At every standstill: what takes seconds is left to the analysis of the finished campaign.
+            problem = IdentificationProblem(self.robot, data, test_poses=poses, joint_corrections="off", starts=0)
+            return identify(problem)
         except NotEnoughDataError as error:
             each = 3 * len(self.robot.targets)
             missing = max(-(-(error.need - error.have) // each), 1)

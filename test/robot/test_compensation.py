@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from calib_planner import Robot
 from calib_planner.errors import InputError
 from calib_planner.robot.compensation import STATUS, Compensation, compensate
+from calib_planner.robot.joint_corrections import JointCorrections
 from calib_planner.robot.elements import rotation
 from calib_planner.robot.urdf import parse_urdf
 
@@ -294,3 +295,22 @@ def test_wrong_input_and_immutable_results() -> None:
     for array in (found.targets, found.corrected, found.position_error):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
+
+
+def test_joints_that_turn_beyond_their_reading():
+    """Told the corrected readings, the real joints (reading + φ) put the tool where the nominal model says."""
+    rng = np.random.default_rng(7)
+    nominal = Robot.load("kuka_kr270")
+    calibrated = nominal.with_deviations({"d2": 1e-3, "q3": -2e-3})
+    waves = rng.normal(0.0, 3e-4, (2, 6, 5))
+    corrections = JointCorrections(nominal.joint_names, np.ones(6), np.zeros(6), *waves)
+    q = np.radians([0.0, -60.0, 90.0, 20.0, 45.0, 10.0]) + rng.normal(0.0, 0.2, (50, 6))
+    found = compensate(nominal, calibrated, q, corrections=corrections)
+    assert set(found.status) == {"reached"}
+    x = found.corrected[..., None] * np.arange(1, 6)
+    actual = found.corrected + np.sum(waves[0] * np.cos(x) + waves[1] * np.sin(x), axis=2)
+    frames = [r.posture(a) for r, a in ((nominal, q), (calibrated, actual))]
+    np.testing.assert_allclose(frames[0].tip_origin, frames[1].tip_origin, atol=2e-9)
+    np.testing.assert_allclose(frames[0].tip_rotation, frames[1].tip_rotation, atol=2e-9)
+    np.testing.assert_allclose(corrections.reading(corrections.actual(q)), q, atol=1e-14)
+    assert found.position_error_before.mean() > 1e-4

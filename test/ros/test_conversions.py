@@ -180,6 +180,7 @@ def test_estimate_there_and_back(robot: Robot, planned: Plan) -> None:
 
 def test_an_estimate_with_infinite_accuracy_travels(robot: Robot, planned: Plan) -> None:
     cell = SimulatedCell(robot, {})
-    found = identify(IdentificationProblem(robot, cell.measure(planned.configurations, 1, 1)))
-    blind = replace(found, std=np.full(4, np.nan), predicted_accuracy_per_test_pose=np.array([np.inf]))
+    data = cell.measure(planned.configurations, 1, 1)
+    found = identify(IdentificationProblem(robot, data, test_poses=planned.configurations[:1]))
+    blind = replace(found, std=np.full(4, np.nan), parameter_accuracy_per_test_pose=np.array([np.inf]))
     assert math.isinf(c.estimate_to_message(blind).predicted_accuracy[0])
