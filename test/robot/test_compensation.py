@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from calib_planner import Robot
 from calib_planner.errors import InputError
 from calib_planner.robot.compensation import STATUS, Compensation, compensate
-from calib_planner.robot.joint_corrections import JointCorrections
 from calib_planner.robot.elements import rotation
+from calib_planner.robot.joint_corrections import JointCorrections
 from calib_planner.robot.urdf import parse_urdf
 
 
