@@ -3,7 +3,7 @@
 Gears, couplings and encoders turn a joint by φ(q) more than it says, repeatably. φ has no constant part, which is
 the joint's zero and a geometric parameter; what is left is a short Fourier series,
 
-    φ_l(q) = Σ_n a_ln cos n x + b_ln sin n x,      x = q for turning joints, half a turn over the range if sliding.
+    φ_l(q) = Σ_n a_ln cos n x + b_ln sin n x,      x = q of turning joints, half a turn over the range if sliding.
 
 With it the robot is where its geometry puts it at the joint values q + φ(q).
 """
