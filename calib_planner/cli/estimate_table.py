@@ -1,78 +1,223 @@
-"""An estimate for people: the verdict, the distances before and after, then parameter by parameter."""
+"""An estimate for people: the verdict with reasons, before → after, predicted against achieved, then details.
+
+Long lists are cut; the files and ``--json`` hold all of it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
-from calib_planner.identification.estimate import Estimate
+from calib_planner.identification.estimate import Estimate, Validation
+from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.report.quantities import length
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
+STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
+WORDS = {
+    "PASS": "PASS: no reason to distrust this calibration",
+    "WARN": "WARN: usable, but look at the reasons",
+    "FAIL": "FAIL: do not rely on this calibration",
+}
+SOURCES = {
+    "sigma": "as given",
+    "instrument": "by the instrument",
+    "data": "by the files' std",
+    "repetitions": "from repetitions",
+    "residuals": "from the residuals",
+}
+HEADINGS = ("count", "mean before", "mean after", "median", "rms", "max", "rms predicted", "in 95 %")
+MOST_POINTS = 10
+MOST_COMBINATIONS = 8
+MOST_POSES = 6
 
 
-def show_estimate(estimate: Estimate, console: Console) -> None:
-    """Print an estimate."""
-    style = "green" if estimate.status == "ok" else "yellow"
-    console.print(f"{estimate.status}: {estimate.message}", style=style)
+def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], str] | None = None) -> None:
+    """Print an estimate; ``where`` says in which line of which file a row of the data stands."""
+    _show_verdict(estimate, console)
     console.print(_distances(estimate))
-    console.print(_precision(estimate))
-    if estimate.test_poses.size:
-        per = ", ".join(length(v) for v in estimate.predicted_accuracy_per_test_pose)
-        console.print(f"Predicted accuracy ρ0 at the test pose: {per}")
+    console.print(_noise(estimate), soft_wrap=True)
+    if len(estimate.test_poses):
+        console.print(_accuracy(estimate), soft_wrap=True)
+    console.print(_counts(estimate), soft_wrap=True)
     console.print(_parameters(estimate))
-    if estimate.held:
-        console.print("Not identifiable from these data (sum that cannot be seen; the first one is held):")
-        for name, combination in zip(estimate.held, estimate.unidentifiable, strict=True):
-            console.print(f"  {name}: {combination}", soft_wrap=True)
-    for row in estimate.rejected:
-        console.print(f"Rejected: row {row['row']}, target {row['target']}: {row['reason']}")
+    combinations = [f"{n}: {c}" for n, c in zip(estimate.held, estimate.unidentifiable, strict=True)]
+    _show_list(console, "Held at nominal; these combinations cannot be seen:", combinations)
+    _show_list(console, "Decided by the prior; the data cannot see:", estimate.resolved_by_prior)
+    _show_list(console, "Hardly seen by the data, weakest first:", estimate.nearly_dependent)
+    _show_points(console, "Rejected", estimate.rejected, where)
+    _show_points(console, "Used, but far off", estimate.suspects, where)
+
+
+def grouped(names: Sequence[str]) -> list[str]:
+    """``base.x, base.y, …`` as ``base.*``, targets likewise; other names as they are."""
+    placed = ("base.", "target_")
+    return list(dict.fromkeys(n.partition(".")[0] + ".*" if n.startswith(placed) else n for n in names))
+
+
+# ── is it good? ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def _show_verdict(estimate: Estimate, console: Console) -> None:
+    verdict = estimate.verdict
+    console.print(WORDS[verdict.level], style=STYLES[verdict.level])
+    for reason in verdict.reasons:
+        label = "note" if reason.level == "PASS" else reason.level
+        text = Text(f"{label}  ", style="dim" if reason.level == "PASS" else STYLES[reason.level])
+        text.append(reason.text, style="not dim not bold default")
+        if reason.advice:
+            text.append(f" → {reason.advice}", style="not bold italic default")
+        console.print(Padding(text, (0, 0, 0, 2)))
 
 
 def _distances(estimate: Estimate) -> Table:
-    """Before → after, for the data and for what was held out."""
+    """Before → after, predicted → achieved: for the data and for what was held out."""
     table = Table(title="distance between measured and predicted points [mm]")
-    for heading in ("points", "count", "before: mean", "after: mean", "rms", "max"):
-        table.add_column(heading, justify="left" if heading == "points" else "right")
+    table.add_column("points", no_wrap=True)
+    for heading in HEADINGS:
+        table.add_column(heading, justify="right")
     before, after = estimate.residual_before, estimate.residual_after
-    values = (before.mean, after.mean, after.rms, after.max)
-    table.add_row("fitted", str(estimate.used), *(_mm(v) for v in values))
-    held_out = estimate.validation
-    if held_out is not None:
-        values = (held_out.before_mean, held_out.mean, held_out.rms, held_out.max)
-        table.add_row("held out", str(held_out.count), *(_mm(v) for v in values))
+    label = "fitted" if estimate.transmission is None else "fitted, geometry"
+    cells = [_mm(before.mean), _mm(after.mean), "", _mm(after.rms), _mm(after.max)]
+    table.add_row(label, str(estimate.used), *cells)
+    for found in (estimate.cross_validation, estimate.validation):
+        if found is not None:
+            label = f"left out, {found.folds} folds" if found.folds else "held out"
+            table.add_row(label, str(found.count), *_held_out(found))
+            if estimate.transmission is not None:
+                table.add_row("… geometry alone", "", "", _mm(found.geometry_mean), "", _mm(found.geometry_rms))
     return table
 
 
-def _precision(estimate: Estimate) -> str:
-    text = f"{estimate.rank} of {len(estimate.parameters)} parameters from {estimate.used} points. "
-    if not np.isfinite(estimate.sigma_estimate):
-        return text + "No redundancy: the residuals say nothing about the noise."
-    return text + f"One coordinate scatters with σ = {length(estimate.sigma_estimate)} about the fit."
+def _held_out(found: Validation) -> list[str]:
+    lengths = (found.before_mean, found.mean, found.median, found.rms, found.max, found.predicted_rms)
+    inside = f"{100 * found.within_95:.0f} %" if np.isfinite(found.within_95) else "unknown"
+    return [*(_mm(v) for v in lengths), inside]
+
+
+def _noise(estimate: Estimate) -> str:
+    """Measurement noise and what no geometric model holds, in one line."""
+    noise = estimate.noise
+    if not np.isfinite(noise.measurement):
+        return "Noise: unknown, nothing is redundant."
+    scaled = f", raised {noise.scaled:.2g} times by repetitions" if noise.scaled > 1 else ""
+    text = f"Noise per coordinate: measurement {length(noise.measurement)} ({SOURCES[noise.source]}{scaled})"
+    if noise.repeat_freedom and noise.source != "repetitions":
+        text += f"; repetitions scatter {length(noise.repeatability)}"
+    return text + _discrepancy(noise) + "." + _corrections(estimate)
+
+
+def _corrections(estimate: Estimate) -> str:
+    """What was learnt beside the geometry."""
+    found = estimate.transmission
+    return "" if found is None else f" Joint corrections were learnt: {1e3 * found.amplitude:.2g} mrad."
+
+
+def _discrepancy(noise: NoiseLevels) -> str:
+    if not noise.discrepancy > 0:
+        return "; no model discrepancy"
+    parts = [f"{1e3 * noise.turning:.3g} mrad in each turning joint"] if noise.turning else []
+    parts += [f"{length(noise.sliding)} in each sliding joint"] if noise.sliding else []
+    parts += [f"{length(noise.point)} in each point"] if noise.point else []
+    return f"; beyond any geometric model {length(noise.discrepancy)} ({', '.join(parts)})"
+
+
+def _accuracy(estimate: Estimate) -> str:
+    per = estimate.predicted_accuracy_per_test_pose
+    shown = ", ".join(length(v) for v in per[:MOST_POSES]) + _more(len(per), MOST_POSES)
+    text = f"Predicted error at the test pose{'s' if len(per) > 1 else ''}: {shown}"
+    own, rest = estimate.parameter_accuracy_per_test_pose, estimate.discrepancy_per_test_pose
+    if np.isfinite(own).all():
+        parts = [length(float(np.sqrt(np.mean(v**2)))) for v in (own, rest)]
+        text += f" (parameters, ρ0: {parts[0]}; beyond the model: {parts[1]})"
+    required = estimate.required_accuracy
+    return text + (f"; required: {length(required)}" if np.isfinite(required) else "")
+
+
+# ── the details ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def _counts(estimate: Estimate) -> str:
+    text = (
+        f"{estimate.status}: {estimate.rank} of {len(estimate.parameters)} parameters from {estimate.used} points"
+    )
+    if estimate.used < estimate.measurements:
+        text += f" of {estimate.measurements}"
+    return text + (f", prior: {estimate.prior}." if estimate.prior else ", no prior.")
 
 
 def _parameters(estimate: Estimate) -> Table:
     table = Table(title="parameters")
-    for heading in ("parameter", "unit", "nominal", "identified", "deviation", "± std"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
-    rows = zip(
-        estimate.parameters,
-        estimate.units,
-        estimate.nominal,
-        estimate.values,
-        estimate.deviations,
-        estimate.std,
-        strict=True,
-    )
-    for name, unit, nominal, value, deviation, std in rows:
+    for heading in ("parameter", "unit", "nominal", "identified", "deviation", "± std", "remark"):
+        left = heading in ("parameter", "unit", "remark")
+        table.add_column(heading, justify="left" if left else "right")
+    remarks = _remarks(estimate)
+    columns = (estimate.nominal, estimate.values, estimate.deviations, estimate.std)
+    for name, unit, *numbers in zip(estimate.parameters, estimate.units, *columns, strict=True):
         label, factor = SHOWN[unit]
+        nominal, value, deviation, std = (factor * v for v in numbers)
         held = name in estimate.held
-        numbers = [f"{factor * v:.4f}" for v in (nominal, value)]
-        change = ["held", ""] if held else [f"{factor * deviation:+.4f}", f"{factor * std:.4f}"]
-        table.add_row(name, label, *numbers, *change)
+        change = ["", ""] if held else [_signed(deviation), f"{std:.4f}"]
+        table.add_row(
+            name,
+            label,
+            f"{nominal:.4f}",
+            f"{value:.4f}",
+            *change,
+            remarks.get(name, ""),
+            style="dim" if held else "",
+        )
+    if any(n.startswith(("base.", "target_")) for n in estimate.parameters):
+        table.caption = "nominal of an unknown base or target: its closed-form start"
     return table
 
 
+def _remarks(estimate: Estimate) -> dict[str, str]:
+    """Held, or with which other parameter most strongly correlated."""
+    found = dict.fromkeys(estimate.held, "held")
+    for a, b, correlation in estimate.correlations:  # strongest first
+        for one, other in ((a, b), (b, a)):
+            found.setdefault(one, f"correlated {correlation:+.3f} with {other}")
+    return found
+
+
+def _show_list(console: Console, title: str, lines: Sequence[str]) -> None:
+    if lines:
+        console.print(title)
+        for line in lines[:MOST_COMBINATIONS]:
+            console.print(f"  {line}", soft_wrap=True)
+        if len(lines) > MOST_COMBINATIONS:
+            console.print(f" {_more(len(lines), MOST_COMBINATIONS)}")
+
+
+def _show_points(
+    console: Console, title: str, points: Sequence[dict[str, Any]], where: Callable[[int], str] | None
+) -> None:
+    """Points with reasons, farthest first."""
+    if not points:
+        return
+    console.print(f"{title}: {len(points)} points, farthest first (rows count from 0)")
+    for point in sorted(points, key=lambda p: -p["normalised_residual"])[:MOST_POINTS]:
+        place = f" ({where(point['row'])})" if where else ""
+        console.print(f"  row {point['row']}, target {point['target']}{place}: {point['reason']}", soft_wrap=True)
+    if len(points) > MOST_POINTS:
+        console.print(f" {_more(len(points), MOST_POINTS)}")
+
+
+def _more(count: int, shown: int) -> str:
+    return f" … and {count - shown} more (all in --json)" if count > shown else ""
+
+
+def _signed(value: float) -> str:
+    text = f"{value:+.4f}"
+    return text[1:] if float(text) == 0 else text
+
+
 def _mm(metres: float) -> str:
-    return f"{1e3 * metres:.4f}"
+    return f"{1e3 * metres:.4f}" if np.isfinite(metres) else "unknown"

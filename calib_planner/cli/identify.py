@@ -12,31 +12,37 @@ from calib_planner.cli.arguments import (
     add_command,
     add_parameters,
     add_robot,
-    add_seed,
-    add_test_poses,
     choose_parameters,
     load_robot,
     test_poses,
 )
 from calib_planner.cli.estimate_table import show_estimate
+from calib_planner.cli.identify_data import Rows, Source, add_data, check_bag_options, read_rows, read_source
+from calib_planner.cli.identify_options import add_checks, add_noise, add_prior, instrument_of, prior_of
+from calib_planner.cli.identify_outputs import add_outputs, check_outputs, tell_outputs, write_outputs
 from calib_planner.cli.terminal import Terminal
+from calib_planner.design.plan import plain
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
-from calib_planner.files.estimate_yaml import write_estimate
-from calib_planner.files.measurements_csv import read_measurements
+from calib_planner.files.estimate_yaml import placement
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.problem import LOSSES, IdentificationProblem
+from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.solver import identify
-from calib_planner.identification.validation import validate
+from calib_planner.identification.validation import cross_validate, validate
 from calib_planner.robot.chain import Robot
 
-EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters offsets \\
-      --unknown base,tool --validate test.csv --validate-target-from 1 --output estimate.yaml"""
+EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \\
+      --unknown base,tool --prior typical --loss robust --folds 5 \\
+      --validate test.csv --validate-target-from 1 --output estimate.yaml"""
 
 DESCRIPTION = """Identify the robot's parameters from measured points.
 
-The CSV has a column per joint [rad | m], in any order, and x1,y1,z1[,x2,…] per reflector in the tracker's
-frame [m]; empty cells: not measured. Optional std_x1,… [m] weigh the points. Other columns are ignored."""
+A CSV has a column per joint [rad | m], in any order, and x1,y1,z1[,x2,…] per reflector in the tracker's
+frame [m]; empty cells: not measured. Optional std_x1,… [m] weigh the points. Other columns are ignored. A bag
+(folder, .db3, .mcap) gives a row per standstill.
+
+The verdict comes first: PASS, WARN or FAIL, with reasons and what to do. It does not change the exit status:
+a calibration that failed its checks is an answer too. Rows count from 0 in JSON and estimate files."""
 
 
 def add(commands: Commands) -> None:
@@ -44,83 +50,90 @@ def add(commands: Commands) -> None:
     parser = add_command(commands, "identify", "identify parameters from measurements", run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
     add_parameters(parser)
-    data = parser.add_argument_group("measurements")
-    data.add_argument("--data", required=True, metavar="FILE", help="CSV of measurements [rad | m]")
-    data.add_argument(
-        "--sigma", type=float, metavar="S", help="std of one coordinate [m] (the file's, else the residuals')"
-    )
-    data.add_argument("--loss", choices=LOSSES, default="linear", help="how residuals count (linear)")
-    data.add_argument("--iterations", type=int, default=50, metavar="N", help="most iterations (50)")
-    add_seed(data)
-    check = parser.add_argument_group("how good is it")
-    add_test_poses(check, "where the predicted accuracy is wanted")
-    check.add_argument("--validate", action="append", metavar="FILE", help="held-out CSV; repeat for several")
-    check.add_argument(
-        "--validate-target-from",
-        type=int,
-        default=0,
-        metavar="N",
-        help="the reflector was re-seated: its offset comes from the first N rows of each held-out file",
-    )
-    parser.add_argument("--output", metavar="FILE", help="write the estimate as YAML")
+    add_data(parser)
+    add_noise(parser)
+    add_prior(parser)
+    add_checks(parser)
+    add_outputs(parser)
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work."""
+    if args.validate_target_from and not args.validate:
+        raise InputError("--validate-target-from", args.validate_target_from, "--validate FILE beside it")
+    check_bag_options(args)
     robot = load_robot(args)
-    data = _read(args.data, robot, args, terminal)
-    robot = _with_targets(robot, data, args)
-    problem = IdentificationProblem(
+    check_outputs(args, robot)
+    rows = read_rows(args.data, robot, args, terminal)
+    robot = _with_targets(robot, rows, args)
+    problem = _problem(robot, rows, args, terminal)
+    held_out = [_held_out(path, robot, args, terminal) for path in args.validate or ()]
+    with terminal.working("identifying"):
+        estimate = _estimate(problem, held_out, args)
+    settled = estimate.status != "not_converged"
+    written = write_outputs(args, estimate) if settled else {}
+    sources = {"data": [{"file": s.path, "rows": len(s.data)} for s in rows.sources]}
+    result = estimate.to_dict() | plain(placement(estimate)) | sources | written
+    terminal.answer(result, partial(show_estimate, estimate, where=rows.where))
+    if not settled:
+        raise CalibPlannerError(estimate.message + (" Nothing was written." if _asked(args) else ""))
+    tell_outputs(args, written, terminal)
+
+
+def _problem(robot: Robot, rows: Rows, args: argparse.Namespace, terminal: Terminal) -> IdentificationProblem:
+    return IdentificationProblem(
         robot=robot,
-        data=data,
+        data=rows.data,
         sigma=args.sigma,
         loss=args.loss,
         test_poses=test_poses(robot, args),
         iterations=args.iterations,
+        prior=prior_of(args, robot, terminal),
+        instrument=instrument_of(args, terminal),
+        discrepancy=args.discrepancy,
+        joint_corrections=args.joint_corrections,
+        starts=args.starts,
+        required_accuracy=args.required_accuracy,
     )
-    held_out = [_read(path, robot, args, terminal) for path in args.validate or ()]
-    if args.validate_target_from and not held_out:
-        raise InputError("--validate-target-from", args.validate_target_from, "--validate FILE beside it")
-    with terminal.working("identifying"):
-        estimate = _estimate(problem, held_out, args.validate_target_from)
-    settled = estimate.status != "not_converged"
-    if args.output and settled:
-        write_estimate(args.output, estimate, "--output")
-    result = estimate.to_dict() | ({"output": args.output} if args.output and settled else {})
-    terminal.answer(result, partial(show_estimate, estimate))
-    if not settled:
-        raise CalibPlannerError(estimate.message + (" Nothing was written." if args.output else ""))
-    if args.output:
-        terminal.note(f"Estimate written to {args.output}")
 
 
-def _estimate(problem: IdentificationProblem, held_out: list[Measurements], target_from: int) -> Estimate:
+def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args: argparse.Namespace) -> Estimate:
     estimate = identify(problem)
-    return validate(problem, estimate, held_out, target_from) if held_out else estimate
+    if estimate.status == "not_converged":
+        return estimate
+    if held_out:
+        estimate = validate(problem, estimate, held_out, args.validate_target_from)
+    return estimate if args.folds is None else cross_validate(problem, estimate, args.folds, args.seed)
 
 
-def _read(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Measurements:
-    file = read_measurements(path, robot, degrees=args.degrees)
-    if file.ignored:
-        terminal.note(f"{path}: columns ignored: {', '.join(file.ignored)}")
-    turning = np.abs(file.data.q[:, robot.joint_is_revolute])
-    if not args.degrees and turning.size and turning.max() > 4 * np.pi:
-        terminal.note(f"{path}: joint angles up to {turning.max():.4g} rad; are they degrees (--degrees)?")
-    return file.data
+def _held_out(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Measurements:
+    """A file of --validate; re-seated targets may be as many as they like."""
+    source: Source = read_source(path, robot, args, terminal)
+    count, most = source.data.p.shape[1], len(robot.targets)
+    if count > most and not args.validate_target_from:
+        advice = "other reflectors need --validate-target-from N"
+        raise FileFormatError(
+            path, "header", f"points of {count} targets", f"at most {most}, as in --data", advice
+        )
+    return source.data
 
 
-def _with_targets(robot: Robot, data: Measurements, args: argparse.Namespace) -> Robot:
+def _with_targets(robot: Robot, rows: Rows, args: argparse.Namespace) -> Robot:
     """The robot with as many targets as the data have, and its active parameters."""
-    count = data.p.shape[1]
+    count = rows.data.p.shape[1]
     if args.targets is None and "tool" in args.unknown.split(","):
         robot = robot.with_targets(np.zeros((count, 3)))
     robot = choose_parameters(robot, args)
     if len(robot.targets) != count:
         raise FileFormatError(
-            args.data,
+            rows.sources[0].path,
             "header",
             f"points of {count} targets",
             f"{len(robot.targets)}, as the robot or --targets says",
             'give --targets "x y z" once per target, or --unknown tool',
         )
     return robot
+
+
+def _asked(args: argparse.Namespace) -> bool:
+    return any((args.output, args.urdf_output, args.kinematics_output))

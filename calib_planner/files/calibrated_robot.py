@@ -7,13 +7,10 @@ import re
 import numpy as np
 
 from calib_planner._arrays import FloatArray
-from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.files.estimate_yaml import SavedEstimate
+from calib_planner.files.saved_estimate import SavedEstimate
 from calib_planner.robot.chain import Robot
 
 TARGET = re.compile(r"target_([1-9]\d{0,2})\.([xyz])")
-SAME = 1e-9
-"""Nominal values may differ by this much between the estimate and the robot [m | rad]."""
 
 
 def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:
@@ -29,29 +26,13 @@ def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:
         InputError: The estimate is of another robot, or of another version of it.
         UnknownNameError: The robot has no parameter of that name.
     """
-    if set(saved.joint_names) != set(robot.joint_names):
-        wanted = f"the robot's joints {', '.join(robot.joint_names)}"
-        raise InputError("estimate", f"joints {', '.join(saved.joint_names)}", wanted, "give the robot it is of")
-    chain: dict[str, float] = {}
     targets: dict[tuple[int, int], float] = {}
-    nominal = {p.name: p.nominal for p in robot.with_parameters(robot.available_parameters).parameters}
-    for name, start, deviation in zip(saved.parameters, saved.nominal, saved.deviations, strict=True):
+    for name, value in zip(saved.parameters, saved.values.tolist(), strict=True):
         target = TARGET.fullmatch(name)
         if target:
-            targets[int(target[1]) - 1, "xyz".index(target[2])] = float(start + deviation)
-        elif not name.startswith("base."):
-            _check_nominal(name, float(start), nominal)
-            chain[name] = float(deviation)
-    moved = robot.with_deviations(chain)
+            targets[int(target[1]) - 1, "xyz".index(target[2])] = value
+    moved = saved.corrected(robot)
     return moved.with_targets(_places(robot, targets)) if targets else moved
-
-
-def _check_nominal(name: str, start: float, nominal: dict[str, float]) -> None:
-    if name not in nominal:
-        raise UnknownNameError("estimate", name, list(nominal))
-    if not abs(start - nominal[name]) <= SAME:
-        got, wanted = f"nominal {start!r}", f"{nominal[name]!r}, the robot's"
-        raise InputError(f"estimate: {name}", got, wanted, "give the robot that the estimate was made with")
 
 
 def _places(robot: Robot, targets: dict[tuple[int, int], float]) -> FloatArray:

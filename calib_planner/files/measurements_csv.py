@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.errors import FileFormatError
 from calib_planner.files.configurations_csv import joint_columns
 from calib_planner.files.table import Table, format_table, read_table, require_columns, shown
@@ -27,10 +27,17 @@ NEARLY = re.compile(r"(std|sigma)?[_ ]*[xyz][_ ]*[0-9]*", re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class MeasurementFile:
-    """What a file held: the measurements and the names of the columns that were ignored."""
+    """What a file held.
+
+    Attributes:
+        data: The measurements.
+        ignored: Names of the columns that were ignored.
+        lines: Line of the file that each row of ``data`` stands in.
+    """
 
     data: Measurements
     ignored: tuple[str, ...]
+    lines: IntArray
 
 
 def read_measurements(path: str | Path, robot: Robot, *, degrees: bool = False) -> MeasurementFile:
@@ -56,7 +63,7 @@ def read_measurements(path: str | Path, robot: Robot, *, degrees: bool = False) 
         if NEARLY.fullmatch(name):
             valid = f"{shown(_names(count, ''))} and std_ of each"
             raise FileFormatError(path, f"column {name[:40]!r}", "an unknown name", valid, "rename it")
-    return MeasurementFile(Measurements(robot.joint_names, q, points, std), ignored)
+    return MeasurementFile(Measurements(robot.joint_names, q, points, std), ignored, table.lines)
 
 
 def write_measurements(path: str | Path, data: Measurements, field: str = "output") -> None:

@@ -72,7 +72,7 @@ def write_calibrated_urdf(
         InputError: The robot is not from a URDF, ``path`` is its source or cannot be written.
         FileFormatError: The source is not readable, or not (or no longer) the URDF of this robot.
     """
-    _refuse_other_robots(robot, field)
+    require_urdf(robot, field)
     origin = Path(robot.source if source is None else source).expanduser()
     if Path(path).expanduser().resolve() == origin.resolve():
         raise InputError(field, str(path), "another file than the nominal URDF", "keep the nominal one")
@@ -89,7 +89,7 @@ def calibrated_urdf(text: str, robot: Robot, source: str = "URDF") -> tuple[str,
         InputError: The robot is not from a URDF.
         FileFormatError: Not the URDF of this robot.
     """
-    _refuse_other_robots(robot, "robot")
+    require_urdf(robot, "robot")
     data = text.encode("utf-8")
     joints = _find_joints(data, source, robot.joint_names)
     wanted = joint_origins(robot)
@@ -104,7 +104,8 @@ def calibrated_urdf(text: str, robot: Robot, source: str = "URDF") -> tuple[str,
     return data.decode("utf-8"), UrdfChanges(tuple(changed), not_in_origins(robot))
 
 
-def _refuse_other_robots(robot: Robot, field: str) -> None:
+def require_urdf(robot: Robot, field: str) -> None:
+    """Refuse a robot that is not from a URDF; ``field`` names the option for the error."""
     if joint_origins(robot).tip is not None:
         advice = "write the kinematics YAML instead, or give the robot as a URDF"
         raise InputError(field, f"robot {robot.name!r} from {robot.source}", "a robot from a URDF", advice)
