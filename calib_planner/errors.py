@@ -96,3 +96,19 @@ class MissingExtraError(CalibPlannerError, ImportError):
     def __init__(self, extra: str, package: str, feature: str) -> None:
         self.extra = extra
         super().__init__(f"{feature} needs {package}; install it with: pip install 'calib_planner[{extra}]'")
+
+
+class StoreError(CalibPlannerError):
+    """Nothing can be written or read at the moment: a full disk, a folder that is not writable, a device in trouble.
+
+    What is there is right; the same thing can be tried again later.
+
+    Attributes:
+        path: The file or folder.
+        reason: What the system says.
+    """
+
+    def __init__(self, path: object, reason: str, advice: str = "") -> None:
+        self.path = str(path)
+        self.reason = reason
+        super().__init__(f"{path}: {reason}; {advice}" if advice else f"{path}: {reason}")
