@@ -24,7 +24,7 @@ from calib_planner.design.plan import Plan
 from calib_planner.errors import InputError
 from calib_planner.instrument.joint_state import pick_joints
 from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
-from calib_planner.ros.motion import PEAK
+from calib_planner.simulation.motion import PEAK
 
 MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""

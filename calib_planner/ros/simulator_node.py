@@ -27,12 +27,12 @@ from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.instrument.standstill import NANO
 from calib_planner.robot.chain import Robot
 from calib_planner.ros.conversions import joints_message, plan_from_message, point_message
-from calib_planner.ros.motion import Tour, make_tour
 from calib_planner.ros.parameters import NodeParameters
 from calib_planner.ros.qos import SENSOR_OUT
 from calib_planner.ros.run import run
 from calib_planner.ros.settings import SimulatorParameters, load_shipped
 from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.simulation.motion import Tour, make_tour
 
 FEEDBACK_PERIOD = 0.1
 """Time between two looks at the execution [s]."""

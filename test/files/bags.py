@@ -12,8 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from calib_planner import Robot
-from calib_planner.ros.motion import make_tour
 from calib_planner.simulation import SimulatedCell
+from calib_planner.simulation.motion import make_tour
 
 NANO = 1_000_000_000
 BEGIN = 1_700_000_000 * NANO

@@ -13,8 +13,8 @@ from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameErro
 from calib_planner.instrument.standstill import Standstill, StandstillDetector
 from calib_planner.ros import saving
 from calib_planner.ros.campaign import Campaign, Matching, TooFew
-from calib_planner.ros.motion import make_tour
 from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.simulation.motion import make_tour
 
 LIMITS = np.array([[-3.0, 3.0], [-3.0, 3.0]])
 HOW = Matching()

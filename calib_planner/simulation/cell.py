@@ -1,9 +1,9 @@
-"""The world we test in: a robot with hidden true parameters and a tracker with noise. Seeded."""
+"""A robot with hidden true parameters and a tracker with noise. Seeded."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from calib_planner._arrays import FloatArray, check_configurations, check_count, check_number
 from calib_planner.errors import InputError
 from calib_planner.identification.measurements import Measurements
+from calib_planner.instrument.noise import Noise
 from calib_planner.robot.chain import Robot
 
 LENGTH_ERROR = 1e-3
@@ -39,18 +40,20 @@ class SimulatedCell:
         nominal: What the controller believes.
         deviations: True deviation of each named parameter [m | rad].
         sigma: Standard deviation of one tracker coordinate [m].
+        instrument: The tracker's noise by direction, in the frame of the points; ``None``: ``sigma`` alike.
+        truth: The robot with those deviations.
     """
 
     nominal: Robot
     deviations: Mapping[str, float]
     sigma: float = 3e-5
+    instrument: Noise | None = None
+    truth: Robot = field(init=False)
 
     def __post_init__(self) -> None:
         check_number("sigma", self.sigma, low=0, high=1, unit="m")
         object.__setattr__(self, "deviations", dict(self.deviations))
         object.__setattr__(self, "truth", self.nominal.with_deviations(self.deviations))
-
-    truth: Robot = None  # type: ignore[assignment]
 
     def measure(self, configurations: ArrayLike, repetitions: ArrayLike | int, seed: int) -> Measurements:
         """Measure each configuration ``repetitions`` times; one row per measurement."""
@@ -62,9 +65,23 @@ class SimulatedCell:
         rows = np.repeat(q, np.asarray(repetitions, np.int64), axis=0)
         rng = np.random.default_rng(seed)
         points = self.truth.positions(rows)
-        noisy = points + self.sigma * rng.standard_normal(points.shape)
-        std = np.full(points.shape, self.sigma) if self.sigma > 0 else None
-        return Measurements(self.nominal.joint_names, rows, noisy, std)
+        noisy = points + self.noise(points, rng)
+        return Measurements(self.nominal.joint_names, rows, noisy, self._std(points))
+
+    def noise(self, points: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """(…, 3) errors of one sample of each of the ``points`` (…, 3) [m]."""
+        draw = rng.standard_normal(points.shape)
+        if self.instrument is None:
+            return self.sigma * draw
+        factor = np.linalg.cholesky(self.instrument.covariance(points))
+        return np.asarray((factor @ draw[..., None])[..., 0])
+
+    def _std(self, points: FloatArray) -> FloatArray | None:
+        """Standard deviation of each coordinate, like ``points`` [m]; ``None`` without noise."""
+        if self.instrument is not None:
+            covariance = self.instrument.covariance(points)
+            return np.asarray(np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
+        return np.full(points.shape, self.sigma) if self.sigma > 0 else None
 
     def position_errors(self, model: Robot, configurations: ArrayLike) -> FloatArray:
         """(N, targets) distances between the true robot and ``model``, eq. (4) [m]."""
