@@ -15,6 +15,7 @@ from rclpy.executors import (
     MultiThreadedExecutor,
     SingleThreadedExecutor,
 )
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 from calib_planner.errors import CalibPlannerError
@@ -45,7 +46,7 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         executor = _executor(threads)
         executor.add_node(node)
         while rclpy.ok() and not asked:
-            executor.spin_once()
+            spin_once(executor)
         return 0
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
@@ -64,6 +65,18 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         if not ended:
             # Python would wait for the thread that is still at work.
             os._exit(0)
+
+
+def spin_once(executor: Executor, timeout: float | None = None) -> None:
+    """Do what is next.
+
+    Where there are several threads, one may destroy a publisher (transition ``cleanup``) just when another
+    collects what to wait for; rclpy's executor then raises, and is as good as new when called again.
+    """
+    try:
+        executor.spin_once(timeout_sec=timeout)
+    except _rclpy.InvalidHandle:
+        return
 
 
 def _executor(threads: int) -> Executor:

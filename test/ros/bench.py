@@ -20,6 +20,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.run import spin_once
+
 DOMAIN = 1 + (os.getpid() * 53 + 11) % 100
 
 
@@ -47,7 +50,7 @@ class Bench:
         def work() -> None:
             while self.context.ok() and not self.stopping:
                 try:
-                    executor.spin_once(timeout_sec=0.1)
+                    spin_once(executor, 0.1)
                 except ExternalShutdownException:
                     return
 
@@ -75,9 +78,12 @@ class Bench:
         rclpy.shutdown(context=self.context)
 
     def start(self, kind: Callable[..., Node], **parameters: Any) -> Any:
+        """The node, spinning; one that starts by itself has done so, or has said why not in ``failure``."""
         node = kind(context=self.context, overrides=overrides(parameters))
         self.nodes.append(node)
         self._spin(node, getattr(kind, "THREADS", 1))
+        if isinstance(node, ManagedNode) and node.settings.value.autostart:
+            self.wait(lambda: node.autostarted, 30.0)
         return node
 
     def wait(self, condition: Callable[[], Any], seconds: float = 15.0) -> None:

@@ -1,0 +1,311 @@
+"""The base of our nodes: a lifecycle node that starts by itself, says why it cannot, and does not fall over.
+
+A node states what it does in four hooks: ``configure`` makes everything it needs from its parameters,
+``activate`` begins, ``deactivate`` ends what is under way, ``clean_up`` forgets. A hook that raises is answered
+by FAILURE with the reason on the log; the node stays and can be configured again. What is made in ``configure``
+or ``activate`` (publishers, subscriptions, services, timers, action servers) is destroyed on the way back, also
+from half the way, and takes QoS overrides (see ``qos``); ``undo_with`` adds other things to that list.
+
+With the parameter ``autostart`` (the default) the node goes to *active* as soon as it spins, so that it can be
+run without a lifecycle manager; with ``autostart: false`` a manager drives it by ``~/change_state``.
+
+An exception in a callback would end the process, whoever sent the message: here it is logged, and a service
+answers that it failed.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.action import ActionServer
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+from calib_planner.errors import CalibPlannerError, UnknownNameError
+from calib_planner.ros.parameters import QOS, NodeParameters, parameter
+from calib_planner.ros.qos import overridable, own
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+@dataclass(frozen=True)
+class LifecycleParameters:
+    """The parameters that every node has; theirs inherit from it."""
+
+    autostart: bool = parameter(
+        True, "go to active by itself; false: a lifecycle manager decides", read_only=True
+    )
+
+
+P = TypeVar("P", bound=LifecycleParameters)
+
+
+class ManagedNode(LifecycleNode, Generic[P]):
+    """See the module.
+
+    Args:
+        name: Of the node.
+        defaults: Its parameters.
+        context: ROS context; default the global one.
+        overrides: Parameter values that win over those of files and the command line.
+
+    Attributes:
+        settings: The parameters; ``settings.value`` is the current dataclass.
+        failure: Why the last transition failed; empty if it did not.
+        autostarted: Whether starting by itself was tried and has ended, one way or the other.
+
+    Raises:
+        InputError: A parameter given at start is unknown or has an unusable value.
+    """
+
+    THREADS = 1
+
+    def __init__(
+        self, name: str, defaults: P, context: Context | None = None, overrides: Sequence[Parameter] = ()
+    ) -> None:
+        self._made: list[ExitStack] = []  # before rclpy makes its own services, by our methods
+        self.failure, self.autostarted = "", False
+        super().__init__(name, context=context, parameter_overrides=list(overrides))
+        service = self._service_change_state
+        service.callback = self._safe_service(service.callback)
+        try:
+            self.settings: NodeParameters[P] = NodeParameters(self, defaults)
+        except Exception:
+            self.destroy_node()
+            raise
+        self._first: Timer | None = None
+        if self.settings.value.autostart:
+            steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may not run yet
+            self._first = super().create_timer(0.0, self._autostart, clock=steady)
+
+    # ── what a node says about itself ────────────────────────────────────────────────────────────────
+
+    def configure(self) -> None:
+        """Make everything from ``self.settings.value``; an exception refuses the transition."""
+
+    def activate(self) -> None:
+        """Begin; an exception refuses the transition."""
+
+    def deactivate(self) -> None:
+        """End what is under way."""
+
+    def clean_up(self) -> None:
+        """Forget what ``configure`` made, besides publishers, services and so on."""
+
+    def undo_with(self, callback: Callable[..., Any], *args: Any) -> None:
+        """In ``configure`` or ``activate``: have ``callback(*args)`` called on the way back, last one first."""
+        self._made[-1].callback(callback, *args)
+
+    @property
+    def state(self) -> str:
+        """``unconfigured``, ``inactive``, ``active``, ``finalized`` or the name of a transition."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the node is at work."""
+        return self.state == "active"
+
+    def close(self) -> bool:
+        """End everything, when the process ends; whether that took no longer than a moment."""
+        while self._made:
+            self._leave("deactivate" if len(self._made) == 2 else "clean_up")
+        return True
+
+    # ── transitions ──────────────────────────────────────────────────────────────────────────────────
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Called by rclpy."""
+        self.settings.in_use = True
+        result = self._enter("configure")
+        self.settings.in_use = result == SUCCESS
+        if result == SUCCESS:
+            self._report_unused_overrides()
+        return result
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Called by rclpy."""
+        return self._enter("activate")
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Called by rclpy."""
+        self._leave("deactivate")
+        return SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Called by rclpy."""
+        self._leave("clean_up")
+        self.settings.in_use = False
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Called by rclpy."""
+        self.close()
+        return SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Called by rclpy."""
+        self.close()
+        self.settings.in_use = False
+        return SUCCESS
+
+    def _enter(self, hook: str) -> TransitionCallbackReturn:
+        """Run ``configure`` or ``activate``; undo it if it raises."""
+        self.failure = ""
+        self._made.append(ExitStack())
+        try:
+            getattr(self, hook)()
+        except Exception as error:
+            self.failure = _reason(error)
+            self.get_logger().error(f"cannot {hook}: {self.failure}")
+            self._attempt(self._made.pop().close)
+            return FAILURE
+        return SUCCESS
+
+    def _leave(self, hook: str) -> None:
+        """Run ``deactivate`` or ``clean_up``, and destroy what was made for it, come what may."""
+        self._attempt(getattr(self, hook))
+        self._attempt(self._made.pop().close)
+
+    def _attempt(self, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except Exception as error:
+            self._say(error)
+
+    def _autostart(self) -> None:
+        if self._first is not None:
+            self.destroy_timer(self._first)
+            self._first = None
+        if self.state == "unconfigured" and self.trigger_configure() == SUCCESS:
+            self.trigger_activate()
+        if self.failure:
+            name = self.get_fully_qualified_name()
+            advice = f"remedy it, then: ros2 lifecycle set {name} configure, and activate"
+            self.get_logger().error(f"not started; {advice}")
+        self.autostarted = True
+
+    def _report_unused_overrides(self) -> None:
+        for name in self._parameter_overrides:
+            if name.startswith(QOS) and not self.has_parameter(name) and "/parameter_events" not in name:
+                valid = sorted(n for n in self._parameters if n.startswith(QOS))
+                self.get_logger().warning(f"{UnknownNameError('parameter', name[:200], valid)}")
+
+    # ── what is made in a transition is destroyed on the way back ────────────────────────────────────
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **others: Any) -> Publisher:
+        """As rclpy's, with QoS overrides."""
+        if not self._made:
+            return super().create_publisher(msg_type, topic, qos_profile, **others)
+        others.setdefault("qos_overriding_options", overridable())
+        made = super().create_publisher(msg_type, topic, own(qos_profile), **others)
+        self.undo_with(self.destroy_publisher, made)
+        return made
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **others: Any
+    ) -> Subscription:
+        """As rclpy's, with QoS overrides; an exception in the callback is logged."""
+        if not self._made:
+            return super().create_subscription(msg_type, topic, callback, qos_profile, **others)
+        others.setdefault("qos_overriding_options", overridable())
+        made = super().create_subscription(msg_type, topic, self._safe(callback), own(qos_profile), **others)
+        self.undo_with(self.destroy_subscription, made)
+        return made
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **others: Any
+    ) -> Service:
+        """As rclpy's; an exception in the callback is logged and answered."""
+        made = super().create_service(srv_type, srv_name, self._safe_service(callback), **others)
+        if self._made:
+            self.undo_with(self.destroy_service, made)
+        return made
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[[], None], *args: Any, **others: Any
+    ) -> Timer:
+        """As rclpy's; an exception in the callback is logged."""
+        made = super().create_timer(timer_period_sec, self._safe(callback), *args, **others)
+        if self._made:
+            self.undo_with(self.destroy_timer, made)
+        return made
+
+    def create_client(self, *args: Any, **others: Any) -> Any:
+        """As rclpy's."""
+        made = super().create_client(*args, **others)
+        if self._made:
+            self.undo_with(self.destroy_client, made)
+        return made
+
+    def create_action_server(
+        self, kind: Any, name: str, execute: Callable[..., Any], **others: Any
+    ) -> ActionServer:
+        """An action server; ``execute`` answers its faults itself, since only it knows its result's words."""
+        made = ActionServer(self, kind, name, execute, **others)
+        if self._made:
+            self.undo_with(made.destroy)
+        return made
+
+    # ── callbacks that do not end the process ────────────────────────────────────────────────────────
+
+    def _safe(self, callback: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(callback)
+        def safe(*args: Any) -> None:
+            try:
+                callback(*args)
+            except Exception as error:
+                self._say(error)
+
+        return safe
+
+    def _safe_service(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(callback)
+        def safe(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except Exception as error:
+                self._say(error)
+                return failed(type(response), _reason(error))
+
+        return safe
+
+    def _say(self, error: Exception) -> None:
+        # Without a context the process is ending, and nothing can be done or said.
+        if self.context.ok():
+            self.get_logger().error(_reason(error), throttle_duration_sec=1.0)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """As rclpy's; an unknown name is refused with the closest valid one instead of an exception."""
+        for given in parameter_list:
+            if given.name not in self._parameters:
+                error = UnknownNameError("parameter", given.name[:100], self.settings.names)
+                return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(parameter_list)
+
+
+def failed(kind: Any, reason: str) -> Any:
+    """A service's response of type ``kind`` that says that it could not be done."""
+    response = kind()
+    if hasattr(response, "message"):
+        response.message = reason
+    if hasattr(kind, "INTERNAL_ERROR"):
+        response.status = kind.INTERNAL_ERROR
+    return response
+
+
+def _reason(error: Exception) -> str:
+    text = str(error) if isinstance(error, CalibPlannerError) else f"{type(error).__name__}: {error}"
+    return text if len(text) <= 1000 else f"{text[:480]} … {text[-480:]}"
