@@ -1,5 +1,24 @@
 """The world we test in: a robot with hidden true parameters, a tracker with noise, and what goes wrong."""
 
 from calib_planner.simulation.cell import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
+from calib_planner.simulation.faults import Faults
+from calib_planner.simulation.motion import Itinerary, Stand, Tour, make_tour
+from calib_planner.simulation.streams import Message, Rates, Streams, play
+from calib_planner.simulation.world import World
 
-__all__ = ["ANGLE_ERROR", "LENGTH_ERROR", "SimulatedCell", "random_deviations"]
+__all__ = [
+    "ANGLE_ERROR",
+    "LENGTH_ERROR",
+    "Faults",
+    "Itinerary",
+    "Message",
+    "Rates",
+    "SimulatedCell",
+    "Stand",
+    "Streams",
+    "Tour",
+    "World",
+    "make_tour",
+    "play",
+    "random_deviations",
+]

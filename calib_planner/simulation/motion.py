@@ -3,16 +3,21 @@
 Between rests all joints move together along s(τ) = 10τ³ − 15τ⁴ + 6τ⁵, at rest at both ends with zero
 acceleration; the fastest joint reaches ``speed``. Every measurement is a standstill of its own, so the robot
 backs off a little between two at (nearly) the same place.
+
+A ``Tour`` is one execution, from its time 0; an ``Itinerary`` is all of them, one after the other, on a clock.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from calib_planner._arrays import FloatArray, IntArray, frozen
+
+NANO = 1_000_000_000
 
 PEAK = 1.875
 """Largest value of ds/dτ."""
@@ -40,8 +45,23 @@ class Phase:
 
 
 @dataclass(frozen=True, eq=False)
+class Stand:
+    """Where the robot is at n times.
+
+    Attributes:
+        joints: (n, joints) [rad | m].
+        arrival: (n,) number of the last arrival for a measurement, from 0; −1 before the first.
+        since: (n,) time since that arrival [s]; infinite unless the robot still stands there.
+    """
+
+    joints: FloatArray
+    arrival: IntArray
+    since: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Tour:
-    """All phases of an execution, from time 0."""
+    """All phases of an execution, from time 0; at least one."""
 
     phases: tuple[Phase, ...]
 
@@ -58,6 +78,24 @@ class Tour:
     def standstills(self, time: float) -> int:
         """Standstills completed by ``time`` [s]."""
         return sum(p.measuring and p.end <= time for p in self.phases)
+
+    def stands(self, times: FloatArray) -> Stand:
+        """Where the robot is at ``times`` (n,) [s], in the last place after the end."""
+        begin, end, start, goal, measuring, arrival = self._columns
+        k = np.maximum(np.searchsorted(begin, times, side="right") - 1, 0)
+        length = np.maximum(end[k] - begin[k], 1e-12)
+        x = np.clip((times - begin[k]) / length, 0.0, 1.0)[:, None]
+        joints = start[k] + (goal[k] - start[k]) * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+        return Stand(joints, arrival[k], np.where(measuring[k], times - begin[k], np.inf))
+
+    @cached_property
+    def _columns(self) -> tuple[FloatArray, ...]:
+        """Begin, end, start, goal, measuring and number of the last arrival, a row per phase."""
+        p = self.phases
+        measuring = np.array([x.measuring for x in p])
+        times = (np.array([x.begin for x in p]), np.array([x.end for x in p]))
+        places = (np.array([x.start for x in p]), np.array([x.goal for x in p]))
+        return (*times, *places, measuring, np.cumsum(measuring) - 1)
 
 
 def make_tour(
@@ -101,3 +139,54 @@ def backed_off(q: FloatArray, limits: FloatArray) -> FloatArray:
     """``q`` (n,) moved by ``BACK_OFF`` towards the middle of the limits."""
     middle = limits.mean(axis=1)
     return q + BACK_OFF * np.where(q <= middle, 1.0, -1.0)
+
+
+# ── one tour after the other ─────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, eq=False)
+class _Leg:
+    """From ``began`` [ns] on: a tour, or a rest at ``joints``; ``arrivals`` were made before, the last at
+    ``arrived`` [ns] if the robot still stands there."""
+
+    began: int
+    joints: FloatArray
+    arrivals: int
+    arrived: int | None
+    tour: Tour | None = None
+
+
+class Itinerary:
+    """Where the robot is at any time of a clock [ns]: at rest, but for the tours it is sent on.
+
+    All that changes is one reference to an immutable value: one thread may send while another looks.
+
+    Args:
+        rest: (joints,) where it stands at first [rad | m].
+    """
+
+    def __init__(self, rest: FloatArray) -> None:
+        self._leg = _Leg(0, frozen(rest), 0, None)
+
+    def begin(self, tour: Tour, stamp: int) -> None:
+        """Send it on ``tour`` at ``stamp`` [ns]."""
+        self.stop(stamp)
+        rest = self._leg
+        self._leg = _Leg(stamp, rest.joints, rest.arrivals, None, tour)
+
+    def stop(self, stamp: int) -> None:
+        """It stands still where it is at ``stamp`` [ns], from then on."""
+        here = self.at(np.array([stamp]))
+        since = float(here.since[0])
+        arrived = stamp - round(since * NANO) if np.isfinite(since) else None
+        self._leg = _Leg(stamp, frozen(here.joints[0]), int(here.arrival[0]) + 1, arrived)
+
+    def at(self, stamps: IntArray) -> Stand:
+        """Where it is at ``stamps`` (n,) [ns]."""
+        leg = self._leg
+        if leg.tour is not None:
+            found = leg.tour.stands((stamps - leg.began) / NANO)
+            return Stand(found.joints, found.arrival + leg.arrivals, found.since)
+        n = len(stamps)
+        since = np.full(n, np.inf) if leg.arrived is None else (stamps - leg.arrived) / NANO
+        return Stand(np.tile(leg.joints, (n, 1)), np.full(n, leg.arrivals - 1), since)
