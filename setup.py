@@ -27,14 +27,14 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "report/templates/*.html"]},
+    package_data={NAME: ["py.typed", "report/templates/*.*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
         *shared_tree("config", "launch"),
     ],
     zip_safe=False,
-    install_requires=["numpy>=1.23", "scipy>=1.8", "PyYAML", "matplotlib>=3.5", "rich>=12"],
+    install_requires=["numpy>=1.23", "scipy>=1.8", "PyYAML", "matplotlib>=3.5", "rich>=12", "Jinja2>=3"],
     extras_require={
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
         "bags": ["rosbags"],

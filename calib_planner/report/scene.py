@@ -1,0 +1,154 @@
+"""What the 3-D view of a calibration shows, in the axes of the robot's own base so that the robot stands upright.
+
+Points x in the tracker's frame become Rᵀ (x − t), with R, t the identified pose of the base; vectors Rᵀ v. The
+tracker stands at the origin of its own frame, that is at −Rᵀ t. Where the points are in the base's frame already,
+nothing says where it stood, unless the instrument does.
+
+Every point is in the scene. Robots are thinned to ``MOST_ROBOTS`` configurations: the largest errors, what was
+rejected, and an even choice of the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.identification.estimate import Estimate
+from calib_planner.identification.problem import IdentificationProblem
+from calib_planner.robot.chain import Robot
+
+MOST_ROBOTS = 300
+"""Configurations whose robot can be shown."""
+USED, SUSPECT, REJECTED = range(3)
+"""States of a point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All positions in the frame of the robot's base [m]; K points were measured, N configurations.
+
+    Attributes:
+        joint_names: Order of ``q``.
+        revolute: (joints,) whether each turns.
+        q: (N, joints) measured configurations [rad | m].
+        rows, targets: (K,) row from 0 and target from 1 of each point.
+        points: (K, 3) measured.
+        after, before: (K, 3) measured − predicted with the identified and with the nominal kinematics.
+        states: (K,) ``USED``, ``SUSPECT`` or ``REJECTED``.
+        robot_rows: (D,) configurations whose robot is drawn.
+        robots: (D, B, 3) base, a point on each joint's axis, tip, then the targets.
+        test_robots: (T, B, 3) the same at the test poses.
+        target_count: The last of the B points that are targets.
+        tracker: (3,) where the tracker stood, or ``None``.
+    """
+
+    joint_names: tuple[str, ...]
+    revolute: tuple[bool, ...]
+    q: FloatArray
+    rows: IntArray
+    targets: IntArray
+    points: FloatArray
+    after: FloatArray
+    before: FloatArray
+    states: IntArray
+    robot_rows: IntArray
+    robots: FloatArray
+    test_robots: FloatArray
+    target_count: int
+    tracker: FloatArray | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Lists, rounded to what can be seen: positions to 10 µm, errors to 10 nm, angles to 10 µrad."""
+        return {
+            "joint_names": list(self.joint_names),
+            "revolute": list(self.revolute),
+            "q": self.q.round(5).tolist(),
+            "rows": self.rows.tolist(),
+            "targets": self.targets.tolist(),
+            "points": self.points.round(5).tolist(),
+            "after": self.after.round(8).tolist(),
+            "before": self.before.round(8).tolist(),
+            "states": self.states.tolist(),
+            "robot_rows": self.robot_rows.tolist(),
+            "robots": self.robots.round(4).tolist(),
+            "test_robots": self.test_robots.round(4).tolist(),
+            "target_count": self.target_count,
+            "tracker": None if self.tracker is None else self.tracker.round(4).tolist(),
+        }
+
+
+def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatArray) -> Scene:
+    """The scene; ``before`` (N, targets, 3) measured − predicted with the nominal kinematics [m]."""
+    data, robot = problem.data, estimate.calibrated
+    turn, place = robot.base_pose
+    where = np.argwhere(data.seen)
+    seen = tuple(where.T)
+    states = point_states(estimate)[seen]
+    size = np.linalg.norm(estimate.residuals[seen], axis=1)
+    rows = _robot_rows(len(data), where[:, 0], np.where(states == USED, size, np.inf))
+    return Scene(
+        joint_names=robot.joint_names,
+        revolute=tuple(bool(r) for r in robot.joint_is_revolute),
+        q=data.q,
+        rows=where[:, 0],
+        targets=where[:, 1] + 1,
+        points=(data.p[seen] - place) @ turn,
+        after=estimate.residuals[seen] @ turn,
+        before=before[seen] @ turn,
+        states=states,
+        robot_rows=rows,
+        robots=_bodies(robot, data.q[rows]),
+        test_robots=_bodies(robot, estimate.test_poses.reshape(-1, len(robot.joint_names))),
+        target_count=len(robot.targets),
+        tracker=_tracker(problem, turn, place),
+    )
+
+
+def point_states(estimate: Estimate) -> IntArray:
+    """(N, targets) state of each point; ``USED`` where there is none."""
+    states = np.full(estimate.normalised_residuals.shape, USED)
+    for state, points in ((SUSPECT, estimate.suspects), (REJECTED, estimate.rejected)):
+        for point in points:
+            states[point["row"], point["target"] - 1] = state
+    return states
+
+
+def thinned(importance: FloatArray, most: int) -> IntArray:
+    """Numbers of at most ``most`` items, ascending: a third the most important, the others spread evenly."""
+    count = len(importance)
+    if count <= most:
+        return np.arange(count)
+    first = np.argsort(-importance, kind="stable")[: most // 3]
+    rest = np.setdiff1d(np.arange(count), first)
+    even = rest[np.linspace(0, len(rest) - 1, most - len(first)).astype(int)]
+    return np.unique(np.concatenate([first, even]))
+
+
+def _robot_rows(count: int, rows: IntArray, importance: FloatArray) -> IntArray:
+    worst = np.full(count, -1.0)
+    np.maximum.at(worst, rows, importance)
+    return thinned(worst, MOST_ROBOTS)
+
+
+def _bodies(robot: Robot, q: FloatArray) -> FloatArray:
+    """(N, B, 3) in the base's frame."""
+    turn, place = robot.base_pose
+    if not len(q):
+        return np.empty((0, len(robot.joint_names) + 2 + len(robot.targets), 3))
+    posture = robot.posture(q)
+    base = np.broadcast_to(place, (len(q), 1, 3))
+    parts = [base, posture.joint_origins, posture.tip_origin[:, None], posture.targets]
+    return np.asarray((np.concatenate(parts, axis=1) - place) @ turn)
+
+
+def _tracker(problem: IdentificationProblem, turn: FloatArray, place: FloatArray) -> FloatArray | None:
+    """From the instrument if it knows its station, else the origin of a frame that is not the base's own."""
+    station = getattr(problem.instrument, "station", None)
+    own = np.allclose(turn, np.eye(3), atol=1e-9) and np.allclose(place, 0.0, atol=1e-9)
+    asked = any(n.startswith("base.") for n in problem.robot.parameter_names)
+    if station is None and own and not asked:
+        return None
+    return np.asarray((np.zeros(3) if station is None else np.asarray(station)) - place) @ turn

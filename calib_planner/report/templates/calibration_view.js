@@ -1,0 +1,393 @@
+// The 3-D view: a camera that orbits a fixed centre, perspective, everything drawn far to near on a 2-D canvas.
+// World: axes of the robot's base, z up [m]. Screen: pixels of the page. No library, no WebGL.
+(function () {
+  "use strict";
+  const data = JSON.parse(document.getElementById("report-data").textContent);
+  const scene = data.scene, count = scene.points.length;
+  const byId = (id) => document.getElementById(id + "-3d");
+  const canvas = byId("canvas"), figure = byId("figure"), image = byId("snapshot");
+  const pen = canvas.getContext("2d");
+  if (!pen || !count) return;
+
+  const HOME = { yaw: -0.87, pitch: 0.38, zoom: 1 };
+  const FACTORS = Array.from({ length: 16 }, (_, i) => [1, 2, 5][i % 3] * 10 ** Math.floor(i / 3));
+  const SHADES = [[158, 188, 218], [140, 150, 198], [140, 107, 177], [136, 65, 157], [110, 1, 107]];
+  const INK = "#16202a", SOFT = "#5b6770", GROSS = "#d55e00", TEST = "#00805a", ARM = "#35516b";
+  const REJECTED = 2, MOST_ARROWS = 400;
+
+  // ── what does not change ──────────────────────────────────────────────────────────────────────────
+
+  const length = (v) => Math.hypot(v[0], v[1], v[2]);
+  const plus = (a, b, k) => [a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]];
+  const quantile = (values, p) => values.slice().sort((a, b) => a - b)[Math.floor(p * (values.length - 1))] || 0;
+  const errors = { after: scene.after.map(length), before: scene.before.map(length) };
+  const good = scene.states.map((s) => s !== REJECTED);
+  const top = {};
+  for (const when of ["after", "before"]) top[when] = quantile(errors[when].filter((_, i) => good[i]), 0.95) || 1e-6;
+  const arrowed = {}; // points whose error vector is drawn: the largest where they are many
+  for (const when of ["after", "before"]) {
+    const least = errors[when].filter((_, i) => good[i]).sort((a, b) => b - a)[MOST_ARROWS - 1] || 0;
+    arrowed[when] = errors[when].map((e, i) => good[i] && e >= least);
+  }
+  const robotOf = new Map(scene.robot_rows.map((row, i) => [row, i]));
+  const solid = [[[0, 0, 0]], scene.robots.flat(), scene.test_robots.flat(), scene.points.filter((_, i) => good[i])].flat();
+  const bounds = boundsOf(solid);
+  const step = [0.1, 0.2, 0.5, 1, 2, 5, 10].find((s) => bounds.radius / s < 5) || 20;
+
+  function boundsOf(points) {
+    const low = [0, 0, 0], high = [0, 0, 0];
+    for (const p of points) for (let a = 0; a < 3; a++) {
+      low[a] = Math.min(low[a], p[a]);
+      high[a] = Math.max(high[a], p[a]);
+    }
+    return { centre: low.map((v, a) => (v + high[a]) / 2), radius: length(low.map((v, a) => high[a] - v)) / 2 || 1 };
+  }
+
+  // ── what the user changes ─────────────────────────────────────────────────────────────────────────
+
+  const state = { ...HOME, when: "after", factor: 1, robot: 0, point: -1 };
+
+  function usualFactor() {
+    const wanted = 0.12 * bounds.radius / top[state.when];
+    const index = FACTORS.findIndex((f) => f > wanted);
+    return Math.max(0, (index < 0 ? FACTORS.length : index) - 1);
+  }
+
+  // ── camera ────────────────────────────────────────────────────────────────────────────────────────
+
+  function camera(width, height) {
+    const [sy, cy, sp, cp] = [Math.sin(state.yaw), Math.cos(state.yaw), Math.sin(state.pitch), Math.cos(state.pitch)];
+    const far = 3.2 * bounds.radius, size = state.zoom * Math.min(width / spread.x, height / spread.y);
+    return projection(sy, cy, sp, cp, far, size, width, height);
+  }
+
+  function projection(sy, cy, sp, cp, far, size, width, height) {
+    return (p) => {
+      const [x, y, z] = plus(p, bounds.centre, -1);
+      const forward = -(x * cy + y * sy) * cp - z * sp;
+      const scale = size * far / Math.max(far + forward, 0.05 * far);
+      const up = -(x * cy + y * sy) * sp + z * cp;
+      return { x: width / 2 + (-x * sy + y * cy) * scale, y: height / 2 - up * scale, depth: forward, scale: scale };
+    };
+  }
+
+  function homeSpread() { // twice the farthest that anything reaches from the middle while the view turns once round
+    const found = { x: 1e-9, y: 1e-9 }, [sp, cp] = [Math.sin(HOME.pitch), Math.cos(HOME.pitch)];
+    for (let k = 0; k < 12; k++) {
+      const yaw = HOME.yaw + k * Math.PI / 6;
+      const see = projection(Math.sin(yaw), Math.cos(yaw), sp, cp, 3.2 * bounds.radius, 1, 0, 0);
+      for (const at of solid.map(see)) {
+        found.x = Math.max(found.x, 2.15 * Math.abs(at.x));
+        found.y = Math.max(found.y, 2.45 * Math.abs(at.y));
+      }
+    }
+    return found;
+  }
+  const spread = homeSpread();
+
+  function shade(error) {
+    const at = Math.min(error / top[state.when], 1) * (SHADES.length - 1), i = Math.min(Math.floor(at), SHADES.length - 2);
+    const mix = SHADES[i].map((c, k) => Math.round(c + (SHADES[i + 1][k] - c) * (at - i)));
+    return `rgb(${mix})`;
+  }
+
+  // ── drawing ───────────────────────────────────────────────────────────────────────────────────────
+
+  function draw(pen, width, height) {
+    const see = camera(width, height), items = [];
+    pen.fillStyle = "#fff";
+    pen.fillRect(0, 0, width, height);
+    floor(pen, see);
+    const vectors = state.when === "after" ? scene.after : scene.before;
+    const radius = Math.max(2, Math.min(4.5, 60 / Math.sqrt(count)));
+    let arrows = 0;
+    scene.points.forEach((p, i) => {
+      const at = see(p), colour = good[i] ? shade(errors[state.when][i]) : GROSS;
+      items.push({ depth: at.depth, paint: () => mark(pen, at, i, radius, colour) });
+      if (!arrowed[state.when][i] && state.point !== i) return;
+      const long = Math.min(state.factor, 0.5 * bounds.radius / Math.max(errors[state.when][i], 1e-12));
+      const from = see(plus(p, vectors[i], -1)), to = see(plus(p, vectors[i], long - 1));
+      arrows += 1;
+      items.push({ depth: at.depth - 1e-6, paint: () => arrow(pen, from, to, colour, long < state.factor) });
+    });
+    scene.test_robots.forEach((body) => body_items(items, pen, see, body, TEST, 2, true));
+    if (scene.robots.length) body_items(items, pen, see, scene.robots[state.robot], ARM, 0.035 * bounds.radius, false);
+    if (scene.tracker) items.push(station(pen, see(scene.tracker), width, height), beam(pen, see));
+    items.sort((a, b) => b.depth - a.depth);
+    for (const item of items) item.paint();
+    axes(pen, see);
+    caption(pen, height);
+    return arrows;
+  }
+
+  function line(pen, a, b, colour, width, dash) {
+    pen.beginPath();
+    pen.setLineDash(dash || []);
+    pen.moveTo(a.x, a.y);
+    pen.lineTo(b.x, b.y);
+    pen.strokeStyle = colour;
+    pen.lineWidth = width;
+    pen.stroke();
+    pen.setLineDash([]);
+  }
+
+  function disc(pen, at, radius, fill, edge) {
+    pen.beginPath();
+    pen.arc(at.x, at.y, radius, 0, 7);
+    pen.fillStyle = fill;
+    pen.fill();
+    if (edge) { pen.strokeStyle = edge; pen.lineWidth = 1.2; pen.stroke(); }
+  }
+
+  function text(pen, words, x, y, colour, align) {
+    pen.font = "12px Arial, 'Liberation Sans', sans-serif";
+    pen.textAlign = align || "left";
+    pen.lineWidth = 3;
+    pen.strokeStyle = "rgba(255,255,255,.85)";
+    pen.strokeText(words, x, y);
+    pen.fillStyle = colour;
+    pen.fillText(words, x, y);
+  }
+
+  function floor(pen, see) {
+    const n = Math.ceil(bounds.radius / step), [cx, cy] = bounds.centre.map((c) => Math.round(c / step));
+    for (let i = -n; i <= n; i++) {
+      line(pen, see([(cx + i) * step, (cy - n) * step, 0]), see([(cx + i) * step, (cy + n) * step, 0]), "#e3e8eb", 1);
+      line(pen, see([(cx - n) * step, (cy + i) * step, 0]), see([(cx + n) * step, (cy + i) * step, 0]), "#e3e8eb", 1);
+    }
+  }
+
+  function mark(pen, at, i, radius, colour) {
+    if (!good[i]) {
+      line(pen, { x: at.x - 5, y: at.y - 5 }, { x: at.x + 5, y: at.y + 5 }, colour, 2.2);
+      line(pen, { x: at.x - 5, y: at.y + 5 }, { x: at.x + 5, y: at.y - 5 }, colour, 2.2);
+    } else disc(pen, at, radius, colour, count < 800 ? "rgba(22,32,42,.55)" : null);
+    if (scene.states[i] === 1) disc(pen, at, radius + 4, "transparent", GROSS);
+    if (state.point === i) disc(pen, at, radius + 7, "transparent", INK);
+  }
+
+  function arrow(pen, from, to, colour, cut) {
+    line(pen, from, to, colour, count > 800 ? 1.3 : 1.8, cut ? [4, 3] : null);
+    const [dx, dy] = [to.x - from.x, to.y - from.y], long = Math.hypot(dx, dy);
+    if (long < 7 || cut) return;
+    const [ux, uy] = [dx / long, dy / long];
+    pen.beginPath();
+    pen.moveTo(to.x, to.y);
+    pen.lineTo(to.x - 6 * ux + 3 * uy, to.y - 6 * uy - 3 * ux);
+    pen.lineTo(to.x - 6 * ux - 3 * uy, to.y - 6 * uy + 3 * ux);
+    pen.fillStyle = colour;
+    pen.fill();
+  }
+
+  function body_items(items, pen, see, body, colour, thickness, ghost) {
+    const arm = body.slice(0, body.length - scene.target_count), tip = arm[arm.length - 1];
+    const seen = arm.map(see);
+    const wide = (at) => (ghost ? thickness : Math.max(3, thickness * at.scale));
+    pen.lineCap = "round";
+    for (let i = 1; i < seen.length; i++) {
+      const [a, b] = [seen[i - 1], seen[i]];
+      items.push({ depth: (a.depth + b.depth) / 2, paint: () => line(pen, a, b, colour, wide(b), ghost ? [5, 4] : null) });
+      if (!ghost && i < seen.length - 1) items.push({ depth: b.depth - 1e-4, paint: () => disc(pen, b, 0.55 * wide(b), "#fff", INK) });
+    }
+    for (const target of body.slice(arm.length)) {
+      const [a, b] = [see(tip), see(target)];
+      items.push({ depth: b.depth, paint: () => {
+        line(pen, a, b, colour, 1.6);
+        disc(pen, b, ghost ? 5 : 3, ghost ? TEST : "#fff", ghost ? "#fff" : INK);
+      } });
+    }
+  }
+
+  function station(pen, at, width, height) {
+    const inside = { x: Math.max(60, Math.min(width - 60, at.x)), y: Math.max(34, Math.min(height - 34, at.y)) };
+    if (inside.x !== at.x || inside.y !== at.y) return { depth: -Infinity, paint: () => {
+      const way = Math.atan2(at.y - height / 2, at.x - width / 2), tip = plus2(inside, way, 14);
+      line(pen, plus2(inside, way, -14), tip, INK, 2);
+      for (const turn of [2.6, -2.6]) line(pen, tip, plus2(tip, way + turn, 8), INK, 2);
+      text(pen, `tracker, ${length(scene.tracker).toFixed(1)} m`, inside.x, inside.y - 18, INK, "center");
+    } };
+    return { depth: at.depth, paint: () => {
+      pen.fillStyle = INK;
+      pen.fillRect(at.x - 6, at.y - 8, 12, 12);
+      for (const dx of [-7, 0, 7]) line(pen, { x: at.x, y: at.y + 4 }, { x: at.x + dx, y: at.y + 15 }, INK, 1.6);
+      text(pen, "tracker", at.x, at.y - 13, INK, "center");
+    } };
+  }
+
+  const plus2 = (p, way, by) => ({ x: p.x + by * Math.cos(way), y: p.y + by * Math.sin(way) });
+
+  function beam(pen, see) {
+    const to = state.point >= 0 ? scene.points[state.point] : scene.robots.length ? scene.robots[state.robot].slice(-1)[0] : scene.tracker;
+    const [a, b] = [see(scene.tracker), see(to)];
+    return { depth: Math.max(a.depth, b.depth), paint: () => line(pen, a, b, "#c2410c", 1, [3, 3]) };
+  }
+
+  function axes(pen, see) {
+    const zero = see([0, 0, 0]);
+    [["x", "#b3201e"], ["y", "#1b6e3c"], ["z", "#0050a0"]].forEach(([name, colour], a) => {
+      const end = see([0, 1, 2].map((k) => (k === a ? 0.7 * step : 0)));
+      line(pen, zero, end, colour, 2.5);
+      text(pen, name, end.x + 4, end.y + 4, colour);
+    });
+  }
+
+  function caption(pen, height) {
+    const which = good.filter(Boolean).length > MOST_ARROWS ? `, the ${MOST_ARROWS} largest` : "";
+    text(pen, `grid ${step} m · error vectors × ${state.factor}, ${state.when} calibration${which}`, 8, height - 9, SOFT);
+  }
+
+  // ── screen, paper ─────────────────────────────────────────────────────────────────────────────────
+
+  let asked = false;
+  function redraw() {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => {
+      asked = false;
+      const ratio = Math.min(window.devicePixelRatio || 1, 3), box = canvas.getBoundingClientRect();
+      if (!box.width) return;
+      canvas.width = Math.round(box.width * ratio);
+      canvas.height = Math.round(box.height * ratio);
+      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+      canvas.dataset.arrows = draw(pen, box.width, box.height);
+      canvas.dataset.points = count;
+    });
+  }
+
+  function snapshot() {
+    const paper = document.createElement("canvas"), ratio = 2;
+    [paper.width, paper.height] = [900 * ratio, 520 * ratio];
+    const ink = paper.getContext("2d");
+    ink.scale(ratio, ratio);
+    draw(ink, 900, 520);
+    image.src = paper.toDataURL("image/png");
+  }
+
+  // ── controls ──────────────────────────────────────────────────────────────────────────────────────
+
+  const mm = (metres) => `${(1e3 * metres).toFixed(4)} mm`;
+
+  function angles(row) {
+    return scene.q[row].map((v, k) => `${scene.joint_names[k]} ${scene.revolute[k] ? (v * 180 / Math.PI).toFixed(2).replace("-", "−") + "°" : mm(v)}`).join(", ");
+  }
+
+  function readout() {
+    const i = state.point, row = i >= 0 ? scene.rows[i] : scene.robot_rows[state.robot];
+    if (row === undefined) return;
+    byId("row").textContent = `row ${row}`;
+    let words = `Row ${row}: ${angles(row)}.`;
+    const target = i >= 0 ? scene.targets[i] - 1 : -1;
+    if (i >= 0) {
+      const sigmas = data.estimate.normalised_residuals[row][target];
+      words += ` Target ${target + 1}: ${mm(data.distances_before[row][target])} before, ${mm(data.distances_after[row][target])} after`;
+      words += sigmas === null ? "" : `, ${sigmas.toFixed(1)} standard deviations`;
+      words += [".", ": beyond the gate, but used.", ": rejected."][scene.states[i]];
+      if (!robotOf.has(row)) words += " Its robot is not among those drawn.";
+    }
+    byId("readout").textContent = words;
+  }
+
+  function showScale() {
+    const colours = SHADES.map((c) => `rgb(${c})`).join(",");
+    const box = byId("scale"), bar = document.createElement("i");
+    bar.style.background = `linear-gradient(90deg,${colours})`;
+    const items = [" test pose (green, dashed)", " rejected ×"].filter((_, k) => (k ? good.includes(false) : scene.test_robots.length));
+    box.replaceChildren(`Error ${state.when}: 0`, bar, `${(1e3 * top[state.when]).toPrecision(3)} mm and more (the largest 5 %).`, items.length ? " Also:" + items.join(",") + "." : "");
+    box.hidden = false;
+  }
+
+  function set(changes) {
+    Object.assign(state, changes);
+    state.pitch = Math.max(-1.57, Math.min(1.57, state.pitch));
+    state.zoom = Math.max(0.3, Math.min(12, state.zoom));
+    byId("robot").value = state.robot;
+    byId("factor").textContent = state.factor;
+    readout();
+    redraw();
+  }
+
+  function setFactor(index) {
+    byId("magnify").value = index;
+    set({ factor: FACTORS[index] });
+  }
+
+  function setRobot(index) {
+    const robot = Math.max(0, Math.min(scene.robot_rows.length - 1, index));
+    set({ robot: robot, point: scene.rows.indexOf(scene.robot_rows[robot]) });
+  }
+
+  function pick(x, y) {
+    const box = canvas.getBoundingClientRect(), see = camera(box.width, box.height);
+    let best = -1, nearest = 16;
+    scene.points.forEach((p, i) => {
+      const at = see(p), apart = Math.hypot(at.x - x + box.left, at.y - y + box.top);
+      if (apart < nearest) [best, nearest] = [i, apart];
+    });
+    const robot = best < 0 ? undefined : robotOf.get(scene.rows[best]);
+    set({ point: best, robot: robot === undefined ? state.robot : robot });
+  }
+
+  const fingers = new Map();
+  let travelled = 0;
+  canvas.addEventListener("pointerdown", (event) => {
+    if (!fingers.size) travelled = 0;
+    fingers.set(event.pointerId, event);
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const last = fingers.get(event.pointerId);
+    if (!last) return;
+    const [dx, dy] = [event.clientX - last.clientX, event.clientY - last.clientY];
+    const others = [...fingers.values()].filter((f) => f.pointerId !== event.pointerId);
+    const apart = (f) => Math.hypot(f.clientX - others[0].clientX, f.clientY - others[0].clientY);
+    const zoom = others.length ? apart(event) / Math.max(apart(last), 1) : 1;
+    fingers.set(event.pointerId, event);
+    travelled += Math.hypot(dx, dy);
+    const share = others.length ? 0.5 : 1;
+    set({ yaw: state.yaw - 0.008 * share * dx, pitch: state.pitch + 0.008 * share * dy, zoom: state.zoom * zoom });
+  });
+  const release = (event) => {
+    if (fingers.delete(event.pointerId) && event.type === "pointerup" && travelled < 5) pick(event.clientX, event.clientY);
+  };
+  canvas.addEventListener("pointerup", release);
+  canvas.addEventListener("pointercancel", release);
+  canvas.addEventListener("wheel", (event) => {
+    if (document.activeElement !== canvas && !event.ctrlKey) return; // the page scrolls on
+    event.preventDefault();
+    set({ zoom: state.zoom * Math.exp(-0.0015 * event.deltaY) });
+  }, { passive: false });
+  canvas.addEventListener("dblclick", () => set(HOME));
+
+  const KEYS = {
+    ArrowLeft: () => set({ yaw: state.yaw + 0.1 }), ArrowRight: () => set({ yaw: state.yaw - 0.1 }),
+    ArrowUp: () => set({ pitch: state.pitch + 0.1 }), ArrowDown: () => set({ pitch: state.pitch - 0.1 }),
+    "+": () => set({ zoom: state.zoom * 1.2 }), "=": () => set({ zoom: state.zoom * 1.2 }), "-": () => set({ zoom: state.zoom / 1.2 }),
+    PageDown: () => setRobot(state.robot + 1), PageUp: () => setRobot(state.robot - 1), 0: () => set(HOME),
+  };
+  canvas.addEventListener("keydown", (event) => {
+    if (!KEYS[event.key] || event.ctrlKey || event.altKey || event.metaKey) return;
+    event.preventDefault();
+    KEYS[event.key]();
+  });
+
+  const VIEWS = { front: { yaw: 0, pitch: 0 }, side: { yaw: -Math.PI / 2, pitch: 0 }, top: { yaw: -Math.PI / 2, pitch: 1.57 }, reset: HOME };
+  for (const button of document.querySelectorAll("[data-view]")) button.addEventListener("click", () => set(VIEWS[button.dataset.view]));
+  for (const choice of document.querySelectorAll("[name=when-3d]")) choice.addEventListener("change", () => {
+    state.when = choice.value;
+    showScale();
+    setFactor(usualFactor());
+  });
+  byId("robot").max = Math.max(0, scene.robot_rows.length - 1);
+  byId("robot").addEventListener("input", (event) => setRobot(Number(event.target.value)));
+  byId("magnify").addEventListener("input", (event) => setFactor(Number(event.target.value)));
+
+  figure.classList.add("live");
+  for (const part of [canvas, byId("controls"), byId("readout")]) part.hidden = false;
+  const worst = errors.after.reduce((best, e, i) => (good[i] && e > errors.after[best] || !good[best] ? i : best), 0);
+  showScale();
+  setFactor(usualFactor());
+  set({ robot: robotOf.get(scene.rows[worst]) || 0, point: worst });
+  snapshot();
+  window.addEventListener("beforeprint", snapshot);
+  window.addEventListener("resize", redraw);
+})();
