@@ -8,14 +8,13 @@ import sys
 from collections.abc import Callable, Sequence
 
 import rclpy
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import (
     Executor,
     ExternalShutdownException,
     MultiThreadedExecutor,
     SingleThreadedExecutor,
 )
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 from calib_planner.errors import CalibPlannerError
@@ -75,7 +74,7 @@ def spin_once(executor: Executor, timeout: float | None = None) -> None:
     """
     try:
         executor.spin_once(timeout_sec=timeout)
-    except _rclpy.InvalidHandle:
+    except InvalidHandle:
         return
 
 
