@@ -67,11 +67,12 @@ class Robot:
                 raise InputError(f"joint_limits of {name}", f"[{low}, {high}]", "lower < upper")
         object.__setattr__(self, "joint_limits", limits)
         names = [e.parameter for e in self._flat if e.parameter]
-        doubled = sorted({n for n in names if names.count(n) > 1})
-        if doubled:
-            raise InputError("elements", ", ".join(doubled), "each parameter name once")
+        known = set(names)
+        if len(known) < len(names):
+            doubled = ", ".join(sorted(n for n in known if names.count(n) > 1))
+            raise InputError("elements", doubled, "each parameter name once")
         for name in self.parameter_names:
-            if name not in names:
+            if name not in known:
                 raise UnknownNameError("parameters", name, names)
 
     # ── making ───────────────────────────────────────────────────────────────────────────────────────
