@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,8 +41,17 @@ def read_plan(path: str | Path) -> Plan:
     Raises:
         FileFormatError: Not a plan of ours; names the key at fault, what it holds and what is valid.
     """
+    return parse_plan(path, read_document(path, "plan"))
+
+
+def parse_plan(path: str | Path, document: Any, finite: Sequence[str] = FINITE) -> Plan:
+    """The plan in a mapping of its fields, of which the arrays in ``finite`` have to be.
+
+    Raises:
+        FileFormatError: As ``read_plan``; ``path`` is for the error.
+    """
     names = [f.name for f in fields(Plan)]
-    document = check_keys(path, "document", read_document(path, "plan"), names)
+    document = check_keys(path, "document", document, names)
     kinds = {f.name: str(f.type) for f in fields(Plan)}
     values = {n: read_value(path, n, kinds[n], document[n]) for n in names}
     for name, axes in SHAPES.items():
@@ -48,7 +59,7 @@ def read_plan(path: str | Path) -> Plan:
         if values[name].shape != wanted:
             expected = f"an array of shape {wanted} (as {', '.join(axes)})"
             raise FileFormatError(path, name, f"shape {values[name].shape}", expected)
-    for name in FINITE:
+    for name in finite:
         if not np.isfinite(values[name]).all():
             raise FileFormatError(path, name, "a number that is not finite", "finite numbers only")
     if not (values["repetitions"] >= 1).all():

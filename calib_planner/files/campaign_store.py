@@ -1,0 +1,302 @@
+"""A campaign on disk: what was accepted is there before anyone is told so.
+
+One file, ``campaign.sqlite``, in a folder that the user chose (``campaign_schema``); without a folder the same in
+memory.
+
+Tables only grow: standstills are raw data, decisions about them are a log (``campaign_records``), and a campaign
+is a plan with the decisions made under it. Only the pointer to the current campaign moves, and a campaign in
+which nothing was measured gives way to the next. The model's source text, the settings and the version of the
+package that wrote are kept beside.
+
+A file of another robot, of a newer schema or one that is damaged is refused and left as it is. When the disk is
+full or gone, ``StoreError`` says so, nothing changes, and the next attempt may succeed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from calib_planner.design.plan import Plan
+from calib_planner.errors import FileFormatError, InputError, StoreError
+from calib_planner.files.campaign_records import (
+    LONGEST,
+    Decision,
+    decision_of,
+    decision_row,
+    plan_of,
+    plan_text,
+    same_plan,
+    standstill_row,
+)
+from calib_planner.files.campaign_schema import FILE, connect, identity, prepare
+
+LATEST = """
+    SELECT s.*, d.* FROM decisions AS d JOIN standstills AS s ON s.number = d.standstill
+    WHERE d.number IN (SELECT MAX(number) FROM decisions WHERE campaign = ? GROUP BY standstill)
+    ORDER BY d.standstill
+"""
+
+
+@dataclass(frozen=True)
+class StoredModel:
+    """Which robot a store belongs to.
+
+    Attributes:
+        name: Of the robot.
+        joint_names: Order of joint arrays.
+        targets: Number of targets.
+        source: The text it was read from, a robot YAML or URDF.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    targets: int
+    source: str
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the source text."""
+        return hashlib.sha256(self.source.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class StoredCampaign:
+    """A plan and what was decided under it.
+
+    Attributes:
+        number: Of the campaign.
+        plan_id, plan: The plan, if any.
+        decisions: The last one about every standstill, in the order of measuring.
+    """
+
+    number: int
+    plan_id: str
+    plan: Plan | None
+    decisions: tuple[Decision, ...]
+
+
+class CampaignStore:
+    """An open store; ``open_store`` makes one."""
+
+    def __init__(self, path: Path | None, database: sqlite3.Connection, model: StoredModel) -> None:
+        self.path, self.model, self._database = path, model, database
+        self._file = None if path is None else identity(path)
+
+    def close(self) -> None:
+        """Let the file go; what was committed is there already."""
+        self._database.close()
+
+    # ── what there is ────────────────────────────────────────────────────────────────────────────────
+
+    def current(self) -> StoredCampaign | None:
+        """The campaign that goes on; ``None`` in a new store.
+
+        Raises:
+            FileFormatError: Damaged rows.
+            StoreError: The file cannot be read now.
+        """
+        row = self._one("SELECT c.* FROM campaigns AS c JOIN current ON current.campaign = c.number")
+        return None if row is None else self._campaign(row)
+
+    def history(self, standstill: int) -> list[dict[str, Any]]:
+        """All that was ever decided about a standstill, oldest first: campaign, status, reason, at."""
+        sql = "SELECT campaign, status, reason, at FROM decisions WHERE standstill = ? ORDER BY number"
+        return [dict(r) for r in self._rows(sql, standstill)]
+
+    # ── what is added ────────────────────────────────────────────────────────────────────────────────
+
+    def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Decision] = ()) -> StoredCampaign:
+        """Make a plan's campaign the current one: the one there is, or a new one.
+
+        Args:
+            carried: What a new campaign takes over from another, as decided under the new plan.
+
+        Raises:
+            InputError: There is another plan of this name.
+            StoreError: It cannot be written.
+        """
+        if len(plan_id) > LONGEST:
+            raise InputError("plan_id", f"{len(plan_id)} characters", f"at most {LONGEST} characters")
+        row = self._one("SELECT * FROM campaigns WHERE plan_id = ? ORDER BY number DESC LIMIT 1", plan_id)
+        if row is not None:
+            known = self._campaign(row)
+            if not same_plan(known.plan, plan):
+                advice = "give the new plan a name of its own, or choose another folder"
+                raise InputError("plan_id", repr(plan_id), "a name that no other plan in the store has", advice)
+            with self._writing() as write:
+                self._point_at(write, known.number)
+            return known
+        return self._new(plan_id, plan, carried)
+
+    def restart(self, plan_id: str, plan: Plan | None) -> StoredCampaign:
+        """A campaign of the same plan with nothing measured; the former stays in the file.
+
+        Raises:
+            StoreError: It cannot be written.
+        """
+        return self._new(plan_id, plan, ())
+
+    def record(self, campaign: int, decision: Decision) -> int:
+        """Write a standstill and what was decided about it; returns its number.
+
+        Raises:
+            StoreError: It cannot be written; nothing was.
+        """
+        with self._writing() as write:
+            number = _insert(write, "standstills", standstill_row(decision.found, decision.frame))
+            _decide(write, campaign, number, decision)
+        return number
+
+    def decide(self, campaign: int, decisions: Sequence[Decision]) -> None:
+        """Write what is thought of standstills now, all of it or nothing.
+
+        Raises:
+            StoreError: It cannot be written; nothing was.
+        """
+        if decisions:
+            with self._writing() as write:
+                for decision in decisions:
+                    _decide(write, campaign, decision.number, decision)
+
+    # ── inside ───────────────────────────────────────────────────────────────────────────────────────
+
+    def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Decision]) -> StoredCampaign:
+        with self._writing() as write:
+            columns = {"plan_id": plan_id, "plan": plan_text(plan), "at": _now()}
+            number = _insert(write, "campaigns", columns)
+            self._point_at(write, number)
+            for decision in carried:
+                _decide(write, number, decision.number, decision)
+        return StoredCampaign(number, plan_id, plan, tuple(carried))
+
+    @staticmethod
+    def _point_at(write: sqlite3.Connection, number: int) -> None:
+        """Make a campaign the current one; others without a standstill go: plans may come by the thousand."""
+        write.execute("INSERT OR REPLACE INTO current VALUES (1, ?)", (number,))
+        write.execute(
+            "DELETE FROM campaigns WHERE number != ? AND number NOT IN (SELECT campaign FROM decisions)",
+            (number,),
+        )
+
+    def _campaign(self, row: Mapping[str, Any]) -> StoredCampaign:
+        where, joints, targets = self.path or "memory", len(self.model.joint_names), self.model.targets
+        rows = self._rows(LATEST, row["number"])
+        decisions = tuple(decision_of(where, r, joints, targets) for r in rows)
+        return StoredCampaign(row["number"], row["plan_id"], plan_of(where, row["plan"]), decisions)
+
+    def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
+        try:
+            return self._database.execute(sql, values).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(self.path, str(error), "check the disk") from None
+
+    def _one(self, sql: str, *values: object) -> Mapping[str, Any] | None:
+        return next(iter(self._rows(sql, *values)), None)
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """One transaction: committed to disk, or as if it had never been."""
+        if self.path is not None and identity(self.path) != self._file:
+            raise StoreError(self.path, "the file was moved, removed or replaced", "put it back")
+        try:
+            self._database.execute("BEGIN IMMEDIATE")
+            yield self._database
+            self._database.execute("COMMIT")
+        except sqlite3.Error as error:
+            self._roll_back()
+            raise StoreError(self.path, str(error), "make space or repair the disk; it is tried again") from None
+        except BaseException:
+            self._roll_back()
+            raise
+
+    def _roll_back(self) -> None:
+        # SQLite may have rolled back itself; a roll-back that fails is made up for by the next BEGIN.
+        if self._database.in_transaction:
+            try:
+                self._database.execute("ROLLBACK")
+            except sqlite3.Error:
+                return
+
+
+# ── opening ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def open_store(
+    folder: str, model: StoredModel, settings: Mapping[str, object], version: str, field: str = "store_folder"
+) -> CampaignStore:
+    """Open the store in a folder, or make one.
+
+    Args:
+        folder: Is made if it is not there; empty: in memory, gone with the process.
+        model: The robot it has to belong to.
+        settings: What else decides what an estimate is; kept for the record.
+        version: Of this package, for the record.
+        field: The parameter that named the folder, for errors.
+
+    Raises:
+        FileFormatError: Not a store, damaged, of a newer schema, or of another robot; it was not touched.
+        InputError: Another process has it.
+        StoreError: It cannot be opened or written now.
+    """
+    path = Path(folder).expanduser() / FILE if folder else None
+    database = connect(path, field)
+    try:
+        prepare(database, path, field)
+        store = CampaignStore(path, database, model)
+        _check_model(store)
+        _note_settings(store, settings, version)
+    except BaseException:
+        database.close()
+        raise
+    return store
+
+
+def _check_model(store: CampaignStore) -> None:
+    model, row = store.model, store._one("SELECT * FROM model")
+    if row is None:
+        with store._writing() as write:
+            columns = {"one": 1, "name": model.name, "joint_names": json.dumps(model.joint_names)}
+            columns |= {"targets": model.targets, "sha256": model.sha256, "source": model.source, "at": _now()}
+            _insert(write, "model", columns)
+        return
+    advice = "choose another folder, or start with the robot that the store belongs to"
+    for field, got, expected in (
+        ("robot", row["name"], model.name),
+        ("joint_names", row["joint_names"], json.dumps(model.joint_names)),
+        ("targets", row["targets"], model.targets),
+        ("model of the robot, sha256", row["sha256"], model.sha256),
+    ):
+        if got != expected:
+            raise FileFormatError(store.path, field, got, str(expected), advice)
+
+
+def _note_settings(store: CampaignStore, settings: Mapping[str, object], version: str) -> None:
+    document = json.dumps(settings, sort_keys=True, default=list)
+    last = store._one("SELECT * FROM settings ORDER BY number DESC LIMIT 1")
+    if last is None or (last["document"], last["version"]) != (document, version):
+        with store._writing() as write:
+            _insert(write, "settings", {"version": version, "document": document, "at": _now()})
+
+
+def _decide(write: sqlite3.Connection, campaign: int, standstill: int, decision: Decision) -> None:
+    columns = {"campaign": campaign, "standstill": standstill, **decision_row(decision), "at": _now()}
+    _insert(write, "decisions", columns)
+
+
+def _insert(write: sqlite3.Connection, table: str, columns: Mapping[str, Any]) -> int:
+    """Add a row; names of table and columns are this file's own."""
+    marks = ", ".join("?" * len(columns))
+    sql = f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({marks})"
+    return int(write.execute(sql, tuple(columns.values())).lastrowid or 0)
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
