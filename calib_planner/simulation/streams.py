@@ -74,7 +74,7 @@ class Streams:
         targets = range(len(world.cell.truth.targets))
         self._samplers = [_Sampler(rates.joints, 0.0), *(_Sampler(rates.tracker, PHASE) for _ in targets)]
         self._posts = [_Post(world, k) for k in range(len(self._samplers))]
-        self._count = 0
+        self._now, self._count = start, 0
         self._waiting: list[tuple[int, int, int, Message]] = []
         self._begin(start)
 
@@ -97,7 +97,7 @@ class Streams:
         return arrived
 
     def _begin(self, now: int) -> None:
-        self._now: int = now
+        self._now = now
         self._waiting.clear()
         for sampler, post in zip(self._samplers, self._posts, strict=True):
             sampler.begin(now)
