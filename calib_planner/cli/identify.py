@@ -17,12 +17,12 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.estimate_table import show_estimate
-from calib_planner.cli.identify_data import Rows, Source, add_data, check_bag_options, read_rows, read_source
+from calib_planner.cli.identify_data import Rows, Source, add_data, check_files, read_rows, read_source
 from calib_planner.cli.identify_options import add_checks, add_noise, add_prior, instrument_of, prior_of
 from calib_planner.cli.identify_outputs import add_outputs, check_outputs, tell_outputs, write_outputs
 from calib_planner.cli.terminal import Terminal
 from calib_planner.design.plan import plain
-from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
+from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, NotEnoughDataError
 from calib_planner.files.estimate_yaml import placement
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.measurements import Measurements
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work."""
     if args.validate_target_from and not args.validate:
         raise InputError("--validate-target-from", args.validate_target_from, "--validate FILE beside it")
-    check_bag_options(args)
+    check_files(args)
     robot = load_robot(args)
     check_outputs(args, robot)
     rows = read_rows(args.data, robot, args, terminal)
@@ -103,7 +103,13 @@ def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args
         return estimate
     if held_out:
         estimate = validate(problem, estimate, held_out, args.validate_target_from)
-    return estimate if args.folds is None else cross_validate(problem, estimate, args.folds, args.seed)
+    if args.folds is None:
+        return estimate
+    try:
+        return cross_validate(problem, estimate, args.folds, args.seed)
+    except NotEnoughDataError as error:
+        text = f"--folds {args.folds}: too little is left without one part ({error})"
+        raise NotEnoughDataError(error.have, error.need, text) from None
 
 
 def _held_out(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Measurements:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -131,12 +132,19 @@ def read_source(path: str, robot: Robot, args: argparse.Namespace, terminal: Ter
     return source
 
 
-def check_bag_options(args: argparse.Namespace) -> None:
+def check_files(args: argparse.Namespace) -> None:
     """Refuse what does not go with the files given.
 
     Raises:
-        InputError: An option for bags without a bag, or --millimetres with one.
+        InputError: A file twice, an option for bags without a bag, or --millimetres with one.
     """
+    taken: set[Path] = set()
+    for flag, path in [("--data", p) for p in args.data] + [("--validate", p) for p in args.validate or ()]:
+        place = Path(path).expanduser().resolve()
+        if place in taken:
+            advice = "a copy is no measurement" if flag == "--data" else "what was fitted proves nothing"
+            raise InputError(flag, f"{path} again", "each file once", advice)
+        taken.add(place)
     bags = [path for path in (*args.data, *(args.validate or ())) if is_bag(path)]
     if bags and args.millimetres:
         advice = "points in bags are in metres (REP-103)"

@@ -28,6 +28,7 @@ from calib_planner.errors import FileFormatError, UnknownNameError
 from calib_planner.files.document import read_mapping
 from calib_planner.files.estimate_yaml import parse_estimate
 from calib_planner.files.sections import Section
+from calib_planner.files.table import shown
 from calib_planner.identification.prior import Prior
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.parameters import Parameter
@@ -41,6 +42,8 @@ UNITS = {
     "deg": ("rad", np.pi / 180),
 }
 """Unit in a file → unit of the parameter, factor."""
+STD = (1e-9, 1e3)
+"""Standard deviations between certainty and no knowledge at all [m | rad]."""
 FARTHEST = 1.0
 """No part of a robot is expected farther from its data sheet than this [m | rad]: the unit is another."""
 
@@ -68,6 +71,8 @@ def read_prior(path: str | Path, robot: Robot, *, targets: bool = False) -> Prio
     if document.get("format") == "calib_planner/estimate":
         return _from_estimate(path, document, robot, targets)
     top = Section(Path(path), "", document)
+    if targets:
+        raise top.error("format", "prior knowledge", "an estimate, to take the targets' places from")
     if "parameters" in document:
         top.only(("parameters", "source"))
         entries = top.section("parameters")
@@ -88,9 +93,9 @@ def _expected(
 ) -> tuple[float, float]:
     """Expected value and standard deviation of one parameter [m | rad]."""
     if name not in nominal:
-        unknown = UnknownNameError("", name, list(nominal))
-        where = f"{entries.where}{name}"
-        raise FileFormatError(entries.path, where, "not asked for", unknown.expected, unknown.advice)
+        advice = UnknownNameError("", name, list(nominal)).advice
+        where = f"{entries.where}{name[:40]}"
+        raise FileFormatError(entries.path, where, "not asked for", f"one of: {shown(list(nominal))}", advice)
     parameter = nominal[name]
     keys = ("value", "deviation", "std", "unit")
     one = Section(
@@ -99,8 +104,9 @@ def _expected(
     one.only(keys, ("std",))
     factor = _factor(one, parameter)
     std = factor * one.number("std")
-    if std <= 0:
-        raise one.error("std", repr(one.values["std"]), "a standard deviation > 0")
+    if not STD[0] <= std <= STD[1]:
+        wanted = f"a standard deviation from {STD[0]:g} to {STD[1]:g} {parameter.unit}"
+        raise one.error("std", repr(one.values["std"])[:60], wanted)
     if "value" in one.values and "deviation" in one.values:
         raise one.error("deviation", "beside value", "one of the two")
     if name in placed:
