@@ -109,12 +109,12 @@ def rejected_since(seen: NDArray[np.bool_], use: NDArray[np.bool_], order: Array
         order: (N,) when each row was measured; ``None``: in the order of the rows.
 
     Returns:
-        ``None`` unless all rejected rows are the last ones, which by chance is less probable than ``SIGNIFICANT``.
+        ``None`` unless all rejected rows are the last ones and that is no chance (see ``SIGNIFICANT``).
     """
     rows = np.flatnonzero(seen.any(axis=1))
     if order is not None:
         rows = rows[np.argsort(np.asarray(order)[rows], kind="stable")]
-    gone = ~use[rows].any(axis=1)
+    gone = np.asarray(~use[rows].any(axis=1))
     count = int(gone.sum())
     if not count or count == len(rows) or not gone[-count:].all() or comb(len(rows), count) * SIGNIFICANT < 1.0:
         return None
