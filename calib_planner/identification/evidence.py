@@ -44,7 +44,6 @@ class Evidence:
     resolved: tuple[int, ...]
     levels: NoiseLevels
     covariance: FloatArray
-    factor: float
     chi_square: float
     freedom: int
     normalised: FloatArray

@@ -4,10 +4,11 @@
 file's own standard deviations say how much of it to expect. *Model discrepancy* is what the residuals show beyond
 it. It is the same each time a configuration is measured, so that repetition does not average it away:
 
-    D(q) = s² I + Σ_l σ_l² c_l c_lᵀ,     c_l = ∂p/∂q_l,
+    D(q) = s² I + s_c² 11ᵀ ⊗ I + Σ_l σ_l² c_l c_lᵀ,     c_l = ∂p/∂q_l,
 
-a part of each point's own and an error of each joint's transmission (see ``design.discrepancy``). The amplitudes
-θ = (s², σ_turning², σ_sliding²) maximise the restricted likelihood (REML; Patterson & Thompson 1971). With
+a part of each point's own, one that all targets of a configuration share, and an error of each joint's
+transmission (see ``design.discrepancy``). The amplitudes
+θ = (s², s_c², σ_turning², σ_sliding²) maximise the restricted likelihood (REML; Patterson & Thompson 1971). With
 Ũ_k = L⁻¹ U_k, whitened residuals r and Q an orthonormal basis of the whitened Jacobian, for each amplitude
 
     score_k = ½ (‖Ũ_kᵀ r‖² − ‖Ũ_k‖² + ‖Ũ_kᵀ Q‖²),     all norms within a configuration's block,
@@ -54,6 +55,7 @@ class NoiseLevels:
         repeatability: What repetitions scatter [m]; NaN without repetitions.
         repeat_freedom: Degrees of freedom of that.
         point: s, discrepancy of each point's own, per coordinate [m].
+        shared: s_c, the same for all targets of a configuration, per coordinate [m]; 0 with a single target.
         turning: σ_l of turning joints [rad].
         sliding: σ_l of sliding joints [m].
         discrepancy: All of the discrepancy, per coordinate, root mean square over the points used [m].
@@ -65,6 +67,7 @@ class NoiseLevels:
     repeatability: float = float("nan")
     repeat_freedom: int = 0
     point: float = 0.0
+    shared: float = 0.0
     turning: float = 0.0
     sliding: float = 0.0
     discrepancy: float = 0.0
@@ -76,11 +79,15 @@ class NoiseLevels:
         if sigma.any():
             columns = (robot.joint_jacobian(q) * sigma).reshape(len(q), len(robot.targets), 3, -1)
             result += columns @ np.swapaxes(columns, 2, 3)
-        return result + self.point**2 * np.eye(3)
+        return result + (self.point**2 + self.shared**2) * np.eye(3)
 
     def for_planning(self) -> ModelDiscrepancy:
         """The same as the planner takes it."""
-        return ModelDiscrepancy(joint_sigma=self.turning, slide_sigma=self.sliding, point_sigma=self.point)
+        return ModelDiscrepancy(
+            joint_sigma=self.turning,
+            slide_sigma=self.sliding,
+            point_sigma=float(np.hypot(self.point, self.shared)),
+        )
 
 
 def repeat_scatter(residuals: FloatArray, labels: IntArray, use: NDArray[np.bool_]) -> tuple[float, int]:
@@ -110,7 +117,7 @@ class DiscrepancyModel:
     """The columns that spread each part of the discrepancy over the equations.
 
     Attributes:
-        names: Parts among ``point``, ``turning``, ``sliding``.
+        names: Parts among ``point``, ``shared``, ``turning``, ``sliding``.
         columns: Per part (equations, K) U.
         blocks: Per block size (blocks, s) numbers of the equations.
         instrument: (points, 3, 3) R of the points in use.
@@ -128,6 +135,8 @@ class DiscrepancyModel:
         n, targets = use.shape
         unit = np.broadcast_to(np.eye(3 * targets).reshape(targets, 3, -1), (n, targets, 3, 3 * targets))
         parts = {"point": unit}
+        if targets > 1:
+            parts["shared"] = np.broadcast_to(np.eye(3), (n, targets, 3, 3))
         levers = robot.joint_jacobian(equations.data.q).reshape(n, targets, 3, -1)
         turns = robot.joint_is_revolute
         if turns.any():

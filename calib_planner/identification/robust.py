@@ -122,17 +122,29 @@ def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, sc
 
 
 def residual_covariance(
-    covariance: FloatArray, jacobian: FloatArray, parameters: FloatArray, use: NDArray[np.bool_]
+    total: FloatArray,
+    weights: FloatArray,
+    jacobian: FloatArray,
+    inverse: FloatArray,
+    parameters: FloatArray,
+    use: NDArray[np.bool_],
 ) -> FloatArray:
     """Covariance of each point's residual: (N, targets, 3, 3) [m²].
 
     Args:
-        covariance: (N, targets, 3, 3) Σ of the points.
+        total: (N, targets, 3, 3) Σ of the points.
+        weights: (N, targets, 3, 3) W⁻¹ of the fit.
         jacobian: (N, targets, 3, P).
+        inverse: (P, P) N⁻¹ of the fit.
         parameters: (P, P) C of the estimate.
-        use: Whether a point took part: Σ − JCJᵀ, else Σ + JCJᵀ.
+        use: Whether a point took part: L(I − H)Lᵀ with Σ = LLᵀ and the hat matrix H of the whitened equations,
+            which is Σ − JCJᵀ where W = Σ⁻¹; else Σ + JCJᵀ.
     """
-    spread = jacobian @ parameters @ np.swapaxes(jacobian, 2, 3)
-    sign = np.where(use, -1.0, 1.0)[:, :, None, None]
+    whitener = np.linalg.inv(np.linalg.cholesky(weights))
+    rows = whitener @ jacobian
     # A point that alone determines a parameter has no residual variance: a floor keeps 0/0 at 0.
-    return covariance * (1.0 + 1e-6) + sign * spread
+    left = (1.0 + 1e-6) * np.eye(3) - rows @ inverse @ np.swapaxes(rows, 2, 3)
+    lower = np.linalg.cholesky(total)
+    inside = lower @ left @ np.swapaxes(lower, 2, 3)
+    outside = total + jacobian @ parameters @ np.swapaxes(jacobian, 2, 3)
+    return np.where(use[:, :, None, None], inside, outside)

@@ -318,7 +318,7 @@ def _fit(
         corrections=JointCorrections(robot.joint_names, scale, shift, *coefficients),
         length=hyper.length,
         amplitude=float(np.sqrt(hyper.variances[-1])),
-        point=float(amplitude["point"]),
+        point=float(np.hypot(amplitude["point"], amplitude.get("shared", 0.0))),
         turning=float(amplitude.get("turning", 0.0)),
         gain=hyper.gain,
         names=tuple(robot.parameter_names[i] for i in kept),

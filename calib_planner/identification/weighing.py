@@ -1,0 +1,169 @@
+"""Fit some of the points, and find out what they weigh.
+
+The first fit takes the instrument's word. Repetitions may contradict it. Residuals that it does not explain have
+a discrepancy (see ``noise_levels``), which the points of a configuration share, and then the covariance of least
+squares with weights W = R⁻¹ is no longer eq. (11) but
+
+    cov(Π̂) = N⁻¹ Jᵀ W Σ W J N⁻¹,     N = Jᵀ W J,     Σ = R + D.
+
+The weights stay the instrument's: on measured robots those of Σ⁻¹ did not predict better, and they rest on more
+assumptions (docs/theory.md). Where no instrument says anything, the residuals give the scale, eq. (11) with σ̂².
+If the targets of one configuration then err alike, it is two scales: what differs between them is the
+measurement, what they share is the robot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner._arrays import FloatArray
+from calib_planner.identification.equations import Equations
+from calib_planner.identification.least_squares import Fit, gauss_newton
+from calib_planner.identification.noise_levels import (
+    FEWEST_REPEATS,
+    FEWEST_SPARE,
+    DiscrepancyModel,
+    NoiseLevels,
+    estimate_variances,
+    improbable,
+    repeat_scatter,
+)
+from calib_planner.identification.structure import SIGNIFICANT, residual_structure
+from calib_planner.identification.work import Work
+
+TINY = 1e-6
+"""Share of the stand-in covariance that keeps matrices regular where the noise is estimated anew."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A fit to some of the points and what it says about the scatter."""
+
+    equations: Equations
+    fit: Fit
+    levels: NoiseLevels
+    weights: FloatArray  # (N, targets, 3, 3) covariance that the equations were whitened with
+    total: FloatArray  # (N, targets, 3, 3) Σ of each point, discrepancy included
+    covariance: FloatArray  # (P, P) cov(Π̂)
+    chi_square: float  # of measurement noise alone
+    freedom: int
+
+
+def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
+    """Fit the points in use and split the scatter."""
+    most = work.problem.iterations
+    instrument, source = work.instrument, work.source
+    equations = work.equations(use, instrument)
+    fit = gauss_newton(equations, first, work.kept, most)
+    seen = 3 * int(use.sum())
+    freedom = len(fit.residuals) - len(work.kept)
+    scatter, repeats = repeat_scatter(_whole(equations, fit), work.labels, use)
+    unit = float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0))
+    repeatability = float(np.sqrt(scatter)) * unit if repeats else float("nan")
+    scaled = 1.0
+    if repeats >= FEWEST_REPEATS and (source == "residuals" or improbable(scatter * repeats, repeats)):
+        instrument = scatter * instrument
+        scaled, source = (1.0, "repetitions") if source == "residuals" else (float(np.sqrt(scatter)), source)
+        equations = work.equations(use, instrument)
+        fit = gauss_newton(equations, fit.deviations, work.kept, most)
+    levels = NoiseLevels(0.0, source, scaled, repeatability, repeats)
+    if source == "residuals":
+        found = _with_scale(work, equations, fit, levels, freedom)
+        apart = work.problem.discrepancy == "auto" and freedom >= FEWEST_SPARE and _targets_err_alike(work, found)
+        return _with_discrepancy(work, found, TINY * instrument) if apart else found
+    cost = fit.cost
+    levels = replace(levels, measurement=float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0)))
+    found = Weighed(equations, fit, levels, instrument, instrument, fit.covariance(), cost, freedom)
+    if work.problem.discrepancy == "off" or not improbable(cost, freedom) or seen <= len(work.kept):
+        return found
+    return _with_discrepancy(work, found, instrument)
+
+
+def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels, freedom: int) -> Weighed:
+    """The noise level from the residuals themselves, eq. (11) with σ̂²."""
+    instrument, scale = work.instrument, 1.0
+    # Without a prior the parameters do not depend on the scale; with one, both settle together.
+    for _ in range(1 if equations.prior is None else 20):
+        own = fit.residuals[: 3 * int(equations.use.sum())]
+        factor = float(own @ own) / freedom if freedom > 0 else float("nan")
+        if equations.prior is None or not np.isfinite(factor) or abs(factor - 1.0) < 1e-6:
+            break
+        scale *= max(factor, 1e-12)
+        equations = work.equations(equations.use, scale * instrument)
+        fit = gauss_newton(equations, fit.deviations, work.kept, work.problem.iterations)
+    unit = float(np.sqrt(instrument[0, 0, 0, 0]))
+    levels = replace(levels, measurement=float(np.sqrt(factor * scale)) * unit)
+    weights = scale * instrument
+    total = (factor if np.isfinite(factor) else 1.0) * weights
+    covariance = (factor if equations.prior is None else 1.0) * fit.covariance()
+    return Weighed(equations, fit, levels, weights, total, covariance, float("nan"), freedom)
+
+
+def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Weighed:
+    """The same points with the scatter that they have, discrepancy included."""
+    equations, data, columns = found.equations, work.problem.data, list(found.fit.kept)
+    model = DiscrepancyModel.of(equations, instrument, work.labels)
+    predicted, jacobian = work.robot.positions_and_jacobian(data.q, found.fit.deviations)
+    rows = jacobian.reshape(*data.p.shape, -1)[equations.use].reshape(-1, jacobian.shape[-1])[:, columns]
+    prior = equations.prior_rows(found.fit.deviations)
+    residuals = (data.p - predicted)[equations.use].ravel()
+    variances = estimate_variances(model, residuals, rows, (prior[0][:, columns], prior[1]))
+    own = float(np.mean(np.einsum("kii->k", instrument[equations.use]))) / 3.0
+    raised = 1.0 + model.mean_square(variances) / own
+    # All points alike: what the prior is worth beside them depends on how far they scatter.
+    equations = work.equations(equations.use, raised * instrument)
+    fit = gauss_newton(equations, found.fit.deviations, found.fit.kept, work.problem.iterations)
+    levels = replace(found.levels, **dict(zip(model.names, np.sqrt(variances).tolist(), strict=True)))
+    measured, left = instrument, variances
+    if levels.source == "residuals":
+        # What differs between the targets of a configuration cannot be told from the measurement.
+        levels = replace(levels, measurement=levels.point, point=0.0)
+        measured = instrument + levels.measurement**2 * np.eye(3)
+        left = np.where([n == "point" for n in model.names], 0.0, variances)
+    levels = replace(levels, discrepancy=float(np.sqrt(model.mean_square(left))))
+    return replace(
+        found,
+        equations=equations,
+        fit=fit,
+        levels=levels,
+        weights=raised * instrument,
+        total=measured + levels.discrepancy_covariance(work.robot, data.q),
+        covariance=_sandwich(equations, fit, model, variances, raised),
+    )
+
+
+def _sandwich(
+    equations: Equations, fit: Fit, model: DiscrepancyModel, variances: FloatArray, raised: float
+) -> FloatArray:
+    """N⁻¹ (JᵀWΣWJ + prior) N⁻¹ for W = (raised · R)⁻¹."""
+    _, jacobian = equations.linearise(fit.deviations)
+    count = len(model.columns[0])
+    own = jacobian[:count]
+    middle = own.T @ own / raised + jacobian[count:].T @ jacobian[count:]
+    for variance, columns in zip(variances, model.columns, strict=True):
+        white = equations.whitening.apply(columns)
+        for index in model.blocks:
+            shared = np.swapaxes(white[index], 1, 2) @ own[index]
+            middle += variance * np.einsum("gka,gkb->ab", shared, shared, optimize=True)
+    inverse = fit.covariance()
+    return inverse @ middle @ inverse
+
+
+def _targets_err_alike(work: Work, found: Weighed) -> bool:
+    use, data = found.equations.use, work.problem.data
+    if use.shape[1] < 2:
+        return False
+    residuals = data.p - work.robot.positions(data.q, found.fit.deviations)
+    structure = residual_structure(work.robot, data.q, residuals, use, work.labels)
+    return any(s.kind == "configuration" and s.probability < SIGNIFICANT for s in structure)
+
+
+def _whole(equations: Equations, fit: Fit) -> FloatArray:
+    """(N, targets, 3) whitened residuals of the points in use; zero elsewhere."""
+    whole = np.zeros(equations.data.p.shape)
+    count = 3 * int(equations.use.sum())
+    whole[equations.use] = fit.residuals[:count].reshape(-1, 3)
+    return whole

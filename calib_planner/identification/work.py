@@ -1,0 +1,97 @@
+"""What stays the same while points come and go: the problem at its start, and which parameters can be found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.design.identifiability import Identifiability, analyse
+from calib_planner.identification.equations import Equations, configuration_labels, point_whitening
+from calib_planner.identification.estimate import Estimate
+from calib_planner.identification.least_squares import gauss_newton
+from calib_planner.identification.problem import IdentificationProblem
+from calib_planner.identification.robust import MEDIAN
+from calib_planner.robot.chain import Robot
+
+FIRST_ITERATIONS = 3
+"""Iterations of the fit that tells how much the points scatter, roughly."""
+UNSEEN = 0.05
+"""A parameter that the data leave this uncertain is not identified by them [m | rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """A problem, its robot at the start, the instrument's covariance and which parameters can be found."""
+
+    problem: IdentificationProblem
+    robot: Robot
+    instrument: FloatArray  # (N, targets, 3, 3); the identity where nothing is known
+    source: str
+    labels: IntArray
+    jacobian: FloatArray  # (N, targets, 3, P) at the start
+    identifiability: Identifiability
+    kept: tuple[int, ...]
+
+    @staticmethod
+    def of(problem: IdentificationProblem, robot: Robot) -> Work:
+        data = problem.data
+        instrument, source = problem.instrument_covariance()
+        jacobian = robot.jacobian(data.q).reshape(*data.p.shape, -1)
+        found = analyse(jacobian[data.seen].reshape(-1, jacobian.shape[-1]), robot.parameter_names)
+        labels = configuration_labels(data.q)
+        work = Work(problem, robot, instrument, source, labels, jacobian, found, found.kept)
+        return work.seeing(0.0)
+
+    @property
+    def unit(self) -> float:
+        """Standard deviation of one coordinate that the instrument has [m]."""
+        return float(np.sqrt(np.mean(np.einsum("kii->ki", self.instrument[self.problem.data.seen]))))
+
+    def seeing(self, sigma: float) -> Work:
+        """The same with what can be seen in spite of coordinates that scatter ``sigma`` [m]."""
+        names, prior = self.robot.parameter_names, self.problem.prior
+        placed = np.array([n.startswith(("base.", "target_")) for n in names])
+        shortest = np.where(placed, 0.0, sigma / UNSEEN)
+        found = self.identifiability
+        if (np.array(found.lengths) < shortest[list(found.kept)]).any():
+            seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
+            found = analyse(seen, names, shortest=shortest)
+        kept = found.kept
+        if prior is not None and found.held:
+            # A prior is worth as many metres of the points as their scatter leaves undecided.
+            rows = (sigma or self.unit) * prior.rows(names, np.zeros(len(names)))[0]
+            seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
+            kept = analyse(np.vstack([seen, rows]), names, shortest=shortest).kept
+        return replace(self, identifiability=found, kept=kept)
+
+    def equations(self, use: NDArray[np.bool_], covariance: FloatArray) -> Equations:
+        """Point by point, under ``covariance`` (N, targets, 3, 3)."""
+        whitening = point_whitening(covariance, use)
+        return Equations(self.robot, self.problem.data, use, whitening, self.problem.prior)
+
+    def start_values(self, start: Estimate | None) -> FloatArray:
+        """(P,) deviations to begin from."""
+        if start is None or start.parameters != self.robot.parameter_names:
+            return np.zeros(len(self.robot.parameter_names))
+        nominal = np.array([p.nominal for p in self.robot.parameters])
+        warm = np.zeros(len(nominal))
+        warm[list(self.kept)] = (start.values - nominal)[list(self.kept)]
+        return warm
+
+
+def without_unseen(work: Work, use: NDArray[np.bool_], start: Estimate | None) -> tuple[Work, FloatArray]:
+    """What can be seen in spite of the scatter that a first fit leaves, and where that fit ended."""
+    first = work.start_values(start)
+    if work.problem.iterations <= FIRST_ITERATIONS:
+        return work, first
+    fit = gauss_newton(work.equations(use, work.instrument), first, work.kept, FIRST_ITERATIONS)
+    count = int(use.sum())
+    squares = np.sum(fit.residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
+    spare = max(3 * count - len(work.kept), 1) / (3 * count)
+    sigma = work.unit * float(np.sqrt(np.median(squares) / MEDIAN / spare))
+    work = work.seeing(sigma)
+    first[list(work.kept)] = fit.deviations[list(work.kept)]
+    return work, first
