@@ -128,7 +128,9 @@ def read_source(path: str, robot: Robot, args: argparse.Namespace, terminal: Ter
             robot if len(robot.targets) == count else robot.with_targets(np.zeros((count, 3))), source.data
         )
     except InputError as error:
-        raise FileFormatError(path, error.field, error.got, error.expected, error.advice) from None
+        doubtful = args.millimetres and error.field == "robot"
+        advice = "they are metres already: leave out --millimetres" if doubtful else error.advice
+        raise FileFormatError(path, error.field, error.got, error.expected, advice) from None
     return source
 
 

@@ -21,6 +21,16 @@ FILES = {
     "word.csv": "q1,q2,x1,y1,z1\n0,zero,1.8,0,0\n",
     "nan.csv": "q1,q2,x1,y1,z1\n0,nan,1.8,0,0\n",
     "joints.csv": "q1,q3,x1,y1,z1\n0,0,1.8,0,0\n",
+    "two_rows.csv": "q1,q2,x1,y1,z1\n0,0,1.8,0,0\n0.5,0.7,1.17,1.22,0\n",
+    "alike.csv": "q1,q2,x1,y1,z1\n" + "0.5,0.7,1.17,1.22,0\n" * 9,
+    "mm.csv": "q1,q2,x1,y1,z1\n0,0,1800,0,0\n0.5,0.7,1170,1220,0\n1,-1,1340,840,0\n",
+    "inf.csv": "q1,q2,x1,y1,z1\n0,0,inf,0,0\n",
+    "empty.csv": "",
+    "header.csv": "q1,q2,x1,y1,z1\n",
+    "good.db3": "q1,q2,x1,y1,z1\n0,0,1.8,0,0\n",
+    "zero.yaml": "parameters: {l1: {std: 0}}\n",
+    "other.yaml": "parameters: {l9: {std: 1.0e-3}}\n",
+    "tags.yaml": "parameters: {l1: !!python/object/apply:os.getcwd []}\n",
     "bad.urdf": "<robot name='x'><link",
     "empty.urdf": "<robot name='x'/>",
     "other.xml.urdf": "<sdf/>",
@@ -62,6 +72,18 @@ CASES = {
     "plan's ending": (f"{PLAN} 2 --test-pose 0,0 --output p.txt", 2, ["--output", ".yaml or .csv"]),
     "output folder": (f"{PLAN} 2 --test-pose 0,0 --output no/p.csv", 2, ["--output", "No such file"]),
     "loss": (f"{IDENTIFY} good.csv --loss square", 2, ["--loss", "linear"]),
+    "sigma and instrument": (f"{IDENTIFY} good.csv --sigma 1 --instrument x", 2, ["not allowed with"]),
+    "sigma of data": (f"{IDENTIFY} good.csv --sigma 0", 2, ["sigma", "(0, inf] m"]),
+    "more folds than data": (f"{IDENTIFY} good.csv --folds 4", 2, ["folds", "from 2 to 3", "got 4"]),
+    "one fold": (f"{IDENTIFY} good.csv --folds 1", 2, ["folds", "from 2"]),
+    "starts": (f"{IDENTIFY} good.csv --starts -1", 2, ["starts", "from 0"]),
+    "required accuracy": (f"{IDENTIFY} good.csv --required-accuracy nan", 2, ["required_accuracy", "nan"]),
+    "discrepancy": (f"{IDENTIFY} good.csv --discrepancy on", 2, ["--discrepancy", "auto"]),
+    "file twice": (f"{IDENTIFY} good.csv --data ./good.csv", 2, ["--data", "good.csv again", "no measurement"]),
+    "fitted and held out": (f"{IDENTIFY} good.csv --validate good.csv", 2, ["--validate", "proves nothing"]),
+    "prior includes": (f"{IDENTIFY} good.csv --prior-includes tool", 2, ["--prior-includes", "an estimate"]),
+    "topic without bag": (f"{IDENTIFY} good.csv --point-topic x", 2, ["--point-topic", "a bag"]),
+    "no URDF": (f"{IDENTIFY} good.csv --urdf-output x.urdf", 2, ["--urdf-output", "from a URDF"]),
     "target from": (f"{IDENTIFY} good.csv --validate-target-from 1", 2, ["--validate FILE"]),
     "true name": (f"{SIMULATE} good.csv --true l9=1", 2, ["deviations", "'l9'", "l1"]),
     "true text": (f"{SIMULATE} good.csv --true l1", 2, ["NAME=VALUE"]),
@@ -78,6 +100,34 @@ CASES = {
     "too few points": (f"{IDENTIFY} one_row.csv", 1, ["3 equations for 4 parameters", "at least 2"]),
     "nothing measured": (f"{IDENTIFY} unseen.csv", 1, ["no measured points"]),
     "targets of the data": (f"{IDENTIFY} two.csv", 1, ["2 targets", "--targets", "--unknown tool"]),
+    "validation of other targets": (
+        f"{IDENTIFY} good.csv --validate two.csv",
+        1,
+        ["two.csv", "2 targets", "at most 1"],
+    ),
+    "all alike": (
+        f"{IDENTIFY} alike.csv --unknown base,tool",
+        1,
+        ["at least 4 configurations", "several joints"],
+    ),
+    "millimetres": (f"{IDENTIFY} mm.csv", 1, ["mm.csv", "coordinates in metres", "--millimetres"]),
+    "metres as millimetres": (f"{IDENTIFY} good.csv --millimetres", 1, ["good.csv", "metres already"]),
+    "infinity in a cell": (f"{IDENTIFY} inf.csv", 1, ["inf.csv", "line 2, column x1", "'inf'"]),
+    "empty file": (f"{IDENTIFY} empty.csv", 1, ["empty.csv", "an empty file", "column names"]),
+    "header only": (f"{IDENTIFY} header.csv", 1, ["header.csv", "a header only"]),
+    "folder that is no bag": (f"{IDENTIFY} .", 1, ["rosbag"]),
+    "no bag": (f"{IDENTIFY} good.db3", 1, ["bag"]),
+    "no such prior": (f"{IDENTIFY} good.csv --prior none.yaml", 1, ["none.yaml", "No such file"]),
+    "prior without std": (
+        f"{IDENTIFY} good.csv --prior zero.yaml",
+        1,
+        ["zero.yaml", "l1.std", "standard deviation"],
+    ),
+    "prior of another": (f"{IDENTIFY} good.csv --prior other.yaml", 1, ["l9", "one of: l1, l2, dq1, dq2"]),
+    "prior with tags": (f"{IDENTIFY} good.csv --prior tags.yaml", 1, ["tags.yaml", "YAML", "prior knowledge"]),
+    "prior that is a plan": (f"{IDENTIFY} good.csv --prior plan.yaml", 1, ["plan.yaml", "format"]),
+    "no such instrument": (f"{IDENTIFY} good.csv --instrument none.yaml", 1, ["none.yaml"]),
+    "folds of too little": (f"{IDENTIFY} two_rows.csv --folds 2", 1, ["--folds 2", "too little", "3 equations"]),
     "validation too short": (
         f"{IDENTIFY} good.csv --validate one_row.csv --validate-target-from 1",
         1,
@@ -116,7 +166,9 @@ def test_an_estimate_that_does_not_settle_is_no_success(
     words = f"{IDENTIFY} {path} --iterations 1 --output {output}"
     assert main(words.split()) == 1
     out, err = capsys.readouterr()
-    assert "not_converged" in out and "Nothing was written" in err and not output.exists()
+    assert (
+        out.startswith("FAIL") and "not_converged" in out and "Nothing was written" in err and not output.exists()
+    )
 
 
 def test_bind_negative() -> None:
