@@ -26,7 +26,11 @@ def read_speed_limits(path: str | Path, joint_names: Sequence[str]) -> FloatArra
     Raises:
         FileFormatError: Not readable, not XML, or a velocity that is no number.
     """
-    text = read_text(path, WHAT)
+    return parse_speed_limits(read_text(path, WHAT), str(path), joint_names)
+
+
+def parse_speed_limits(text: str, path: str, joint_names: Sequence[str]) -> FloatArray | None:
+    """Like ``read_speed_limits``, from the text itself; ``path`` names it in errors."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # no entity is ever expanded
         raise FileFormatError(path, "document", "a document type declaration", "plain URDF without one")
     try:
@@ -38,7 +42,7 @@ def read_speed_limits(path: str | Path, joint_names: Sequence[str]) -> FloatArra
     return frozen(speeds) if (speeds > 0).all() else None
 
 
-def _velocity(path: str | Path, joint: ElementTree.Element) -> float:
+def _velocity(path: str, joint: ElementTree.Element) -> float:
     """The joint's speed limit [rad/s | m/s]; 0 where there is none."""
     limit = joint.find("limit")
     word = "0" if limit is None else limit.get("velocity", "0")

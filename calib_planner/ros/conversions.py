@@ -11,20 +11,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration, Time
+from builtin_interfaces.msg import Time
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from geometry_msgs.msg import Point, PointStamped, Vector3
 from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_planner._arrays import FloatArray, check_array, check_number
 from calib_planner.design.plan import Plan
 from calib_planner.errors import InputError
 from calib_planner.instrument.joint_state import pick_joints
 from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
-from calib_planner.simulation.motion import PEAK
 
 MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""
@@ -180,19 +178,6 @@ def check_rows(field: str, flat: ArrayLike, joints: Sequence[str], least: int = 
         raise InputError(field, f"{values.size} numbers", expected)
     rows = values.reshape(-1, n)
     return check_array(field, rows, (None, n), meaning="joints in rad or m")
-
-
-def trajectory_message(plan: Plan, speed: float, stamp: int, frame_id: str) -> JointTrajectory:
-    """The configurations in order, with times that keep every joint below ``speed`` [rad/s | m/s]."""
-    result = JointTrajectory(joint_names=list(plan.joint_names))
-    result.header.stamp, result.header.frame_id = stamp_message(stamp), frame_id
-    steps = np.abs(np.diff(plan.configurations, axis=0)).max(axis=1, initial=0.0) * PEAK / speed
-    for q, time in zip(plan.configurations, np.cumsum([1.0, *steps]), strict=True):
-        after = round(float(time) * NANO)
-        point = JointTrajectoryPoint(positions=q.tolist(), velocities=[0.0] * len(q))
-        point.time_from_start = Duration(sec=after // NANO, nanosec=after % NANO)
-        result.points.append(point)
-    return result
 
 
 # ── measuring ────────────────────────────────────────────────────────────────────────────────────────

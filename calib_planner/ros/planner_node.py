@@ -1,7 +1,9 @@
 """Node ``calibration_planner``: plans on request (service and action) and publishes the newest plan.
 
-Planning runs in a thread of the executor's pool beside everything else, one request at a time: a second one
-is told BUSY. What is decided is in ``planning``; this file only carries messages.
+What is decided is in ``planning``, which robot it is for in ``model_source``; this file only carries messages.
+Planning runs in a thread of the executor's pool beside all others, one request at a time: a second one is told
+BUSY. A thread is enough: under a search that fills a core, a parameter is answered in some milliseconds,
+because NumPy gives the interpreter away many times per millisecond.
 """
 
 from __future__ import annotations
@@ -15,59 +17,97 @@ from collections.abc import Callable, Sequence
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration as PlanService
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from calib_planner.design.planner import Progress
-from calib_planner.ros.conversions import plan_to_message, trajectory_message
-from calib_planner.ros.parameters import NodeParameters
-from calib_planner.ros.planning import Answer, answer
+from calib_planner.errors import CalibPlannerError
+from calib_planner.ros.conversions import plan_to_message
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.markers import plan_markers
+from calib_planner.ros.model_source import TOPIC, Model, ModelSource
+from calib_planner.ros.planning import Answer, answer, constraints_of
 from calib_planner.ros.qos import LATCHED
 from calib_planner.ros.run import run
-from calib_planner.ros.settings import PlannerParameters, load_shipped
+from calib_planner.ros.settings import PlannerParameters
+from calib_planner.ros.trajectory import pace_of, trajectory_message
 
 FEEDBACK_PERIOD = 0.1
 """Shortest time between two feedback messages [s]."""
+PATIENCE = 4.0
+"""Time that a search gets to end when it is stopped [s]; it looks every few milliseconds."""
 
 
-class PlannerNode(Node):
+class PlannerNode(ManagedNode[PlannerParameters]):
     """See the module."""
 
     THREADS = 4
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        super().__init__("calibration_planner", context=context, parameter_overrides=list(overrides))
-        self.settings = NodeParameters(self, PlannerParameters())
+        self._busy, self._closing = threading.Lock(), threading.Event()
+        super().__init__("calibration_planner", PlannerParameters(), context, overrides)
+
+    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
+
+    def configure(self) -> None:
+        """Load the robot, listen for another one, offer planning."""
         chosen = self.settings.value
-        self._robot = load_shipped(chosen.robot, chosen.parameters, chosen.unknown)
-        self._busy = threading.Lock()
-        self._closing = threading.Event()
-        self._plan_publisher = self.create_publisher(PlanMessage, "~/current_plan", LATCHED)
-        self._trajectory_publisher = self.create_publisher(JointTrajectory, "~/trajectory", LATCHED)
+        self._source = ModelSource(chosen)
+        if isinstance(self._source.model, Model):
+            constraints_of(chosen, self._source.model.robot)
+        self._publishers_of = (
+            self.create_publisher(PlanMessage, "~/current_plan", LATCHED),
+            self.create_publisher(JointTrajectory, "~/trajectory", LATCHED),
+            self.create_publisher(MarkerArray, "~/markers", LATCHED),
+        )
+        if chosen.use_robot_description:
+            alone = MutuallyExclusiveCallbackGroup()
+            self.create_subscription(String, TOPIC, self._on_description, LATCHED, callback_group=alone)
         group = ReentrantCallbackGroup()
-        self._service = self.create_service(PlanService, "~/request_plan", self._on_request, callback_group=group)
-        self._action = ActionServer(
-            self,
+        self.create_service(PlanService, "~/request_plan", self._on_request, callback_group=group)
+        self.create_action_server(
             PlanAction,
             "~/plan",
             self._on_goal,
             callback_group=group,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
-        self.get_logger().info(f"ready to plan for {self._robot.name}")
+
+    def activate(self) -> None:
+        """Answer requests."""
+        self._closing.clear()
+        model = self._source.model
+        ready = f"ready to plan for {model.robot.name}" if isinstance(model, Model) else str(model)
+        self.get_logger().info(ready)
+
+    def deactivate(self) -> None:
+        """End a search that is under way."""
+        self._closing.set()
+        if self._busy.acquire(timeout=PATIENCE):
+            self._busy.release()
 
     def close(self) -> bool:
-        """End a search that is under way; whether it did within a moment."""
-        self._closing.set()
-        ended = self._busy.acquire(timeout=4.0)
-        if ended:
-            self._busy.release()
-        return ended
+        """End everything; whether a search ended in time."""
+        super().close()
+        return not self._busy.locked()
+
+    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
+
+    def _on_description(self, message: String) -> None:
+        try:
+            model = self._source.take(message.data)
+        except CalibPlannerError as error:
+            self.get_logger().error(f"{TOPIC} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
+            return
+        if model is not None:
+            joints = ", ".join(model.robot.joint_names)
+            self.get_logger().info(f"{TOPIC}: {model.robot.name}, joints {joints}")
 
     def _on_request(self, request: PlanService.Request, response: PlanService.Response) -> PlanService.Response:
         result = self._work(request, lambda _: self._closing.is_set())
@@ -85,7 +125,7 @@ class PlannerNode(Node):
 
         result = self._work(goal.request, progress)
         response = self._fill(PlanAction.Result(), result)
-        if not self._closing.is_set():
+        if self.context.ok():
             if goal.is_cancel_requested:
                 goal.canceled()
             elif result.status == "SUCCESS":
@@ -94,25 +134,32 @@ class PlannerNode(Node):
                 goal.abort()
         return response
 
+    # ── planning ─────────────────────────────────────────────────────────────────────────────────────
+
     def _work(
         self,
         request: PlanService.Request | PlanAction.Goal,
         callback: Callable[[Progress], bool],
     ) -> Answer:
         """The way of every request: one at a time, never an exception."""
+        if not self.is_active:
+            return Answer("NOT_READY", "", f"the node is {self.state}, not active: activate it")
         if not self._busy.acquire(blocking=False):
             return Answer("BUSY", "", "another request is being worked on: ask again later")
         began = time.perf_counter()
         try:
-            result = answer(request, self.settings.value, self._robot, callback)
+            result = answer(request, self.settings.value, self._source.model, callback)
         except Exception as error:
-            self.get_logger().error(f"planning failed: {error!r}")
-            result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {error}")
+            result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {str(error)[:1000]}")
         finally:
             self._busy.release()
-        if not self._closing.is_set():
+        if self.context.ok():
             seconds = time.perf_counter() - began
-            self.get_logger().info(f"{result.status} after {seconds:.2f} s: {result.message}")
+            text = f"{result.status} after {seconds:.2f} s: {result.message}"
+            if result.status == "INTERNAL_ERROR":
+                self.get_logger().error(text)
+            else:
+                self.get_logger().info(text)
         return result
 
     def _fill(
@@ -121,19 +168,29 @@ class PlannerNode(Node):
         """Put the answer into a response, and publish its plan."""
         # A search that the service's node ends itself is no outcome the service has a word for.
         known = hasattr(type(response), result.status)
-        response.status = getattr(type(response), result.status if known else "INTERNAL_ERROR")
+        response.status = getattr(type(response), result.status if known else "NOT_READY")
         response.field, response.message = result.field, result.message
-        if result.plan is None:
+        if result.plan is None or result.model is None:
             response.plan = PlanMessage(status=PlanMessage.STATUS_EMPTY)
         else:
             settings, stamp = self.settings.value, self.get_clock().now().nanoseconds
-            name = uuid.uuid4().hex[:12]
-            response.plan = plan_to_message(result.plan, name, stamp, settings.frame_id)
+            response.plan = plan_to_message(result.plan, uuid.uuid4().hex[:12], stamp, settings.frame_id)
             if not self._closing.is_set():
-                path = trajectory_message(result.plan, settings.joint_speed, stamp, settings.frame_id)
-                self._plan_publisher.publish(response.plan)
-                self._trajectory_publisher.publish(path)
+                self._publish(response.plan, result, stamp)
         return response
+
+    def _publish(self, message: PlanMessage, result: Answer, stamp: int) -> None:
+        """The plan, how to drive it, and how it looks."""
+        assert result.plan is not None and result.model is not None
+        found, robot, settings = result.plan, result.model.robot, self.settings.value
+        plans, trajectories, pictures = self._publishers_of
+        plans.publish(message)
+        pace = pace_of(robot, settings.joint_speed, settings.slide_speed, result.model.speeds, settings.dwell)
+        try:
+            trajectories.publish(trajectory_message(found, robot, pace, stamp, settings.frame_id))
+        except CalibPlannerError as error:
+            self.get_logger().error(f"no ~/trajectory: {error}")
+        pictures.publish(plan_markers(found, robot, stamp, settings.frame_id))
 
 
 def feedback_message(state: Progress) -> PlanAction.Feedback:

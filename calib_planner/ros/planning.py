@@ -9,19 +9,28 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from calib_planner._arrays import FloatArray
+from calib_planner.design.discrepancy import ModelDiscrepancy
+from calib_planner.design.feasibility import Constraint
 from calib_planner.design.plan import Plan
 from calib_planner.design.planner import Progress, plan
 from calib_planner.design.problem import PlanProblem
 from calib_planner.errors import InfeasibleError, InputError
+from calib_planner.files.constraints_yaml import read_constraints
+from calib_planner.robot.catalogue import config_folder
 from calib_planner.robot.chain import Robot
 from calib_planner.ros.conversions import check_rows
-from calib_planner.ros.settings import PlannerParameters, load_shipped
+from calib_planner.ros.model_source import Model, NotReady, shipped_model
+from calib_planner.ros.settings import PlannerParameters, unknown_words
 
 MOST_PARAMETERS = 1000
 FIELD_OF = {"weights": "test_pose_weights"}
 """The request's word for a field of ``PlanProblem``, where they differ."""
+
+Callback = Callable[[Progress], bool | None]
 
 
 @dataclass(frozen=True)
@@ -33,44 +42,48 @@ class Answer:
         field: Request field at fault; empty if none.
         message: The outcome and what to do.
         plan: The plan, if there is a usable one.
+        model: The robot it is for.
     """
 
     status: str
     field: str
     message: str
     plan: Plan | None = None
+    model: Model | None = None
 
 
 def answer(
     request: Any,
     settings: PlannerParameters,
-    own: Robot,
-    callback: Callable[[Progress], bool | None] | None = None,
+    own: Model | NotReady,
+    callback: Callback | None = None,
 ) -> Answer:
     """Plan what is asked; every fault of the request becomes an ``Answer``."""
     try:
-        found = plan(problem_of(request, settings, own), callback)
+        model = _model(request, settings, own)
+        found = plan(problem_of(request, settings, model), callback)
+    except NotReady as error:
+        return Answer("NOT_READY", "robot", _shortened(str(error)))
     except InputError as error:
         field = re.match(r"\w*", error.field)
         name = field[0] if field else ""
         return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), _shortened(str(error)))
     except InfeasibleError as error:
-        return Answer("INFEASIBLE", error.constraint, _shortened(str(error)))
+        return Answer("INFEASIBLE", _shortened(error.constraint), _shortened(str(error)))
     if found.status == "singular":
         return Answer("INFEASIBLE", "configurations", found.message)
-    if found.status == "cancelled":
-        return Answer("CANCELLED", "", found.message, found)
-    return Answer("SUCCESS", "", found.message, found)
+    status = "CANCELLED" if found.status == "cancelled" else "SUCCESS"
+    return Answer(status, "", found.message, found, model)
 
 
-def problem_of(request: Any, settings: PlannerParameters, own: Robot) -> PlanProblem:
+def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanProblem:
     """The library's problem for a request; zero and empty fields take the node's defaults.
 
     Raises:
         InputError: A field is not usable.
         InfeasibleError: No plan can satisfy the request.
     """
-    robot = _robot(request, settings, own)
+    robot = model.robot
     poses = check_rows("test_poses", request.test_poses, robot.joint_names, least=0)
     if len(poses) > settings.most_test_poses:
         raise InputError("test_poses", f"{len(poses)} poses", f"at most {settings.most_test_poses}")
@@ -84,6 +97,9 @@ def problem_of(request: Any, settings: PlannerParameters, own: Robot) -> PlanPro
     sigma = float(request.sigma)
     if not 0 <= sigma <= 1.0:
         raise InputError("sigma", sigma, "0 (the node's default) to 1 m")
+    criterion = request.criterion or settings.criterion
+    candidates = _candidates(request, settings, robot)
+    real = model.described and candidates is not None and criterion == "test_pose"
     return PlanProblem(
         robot,
         poses,
@@ -91,22 +107,63 @@ def problem_of(request: Any, settings: PlannerParameters, own: Robot) -> PlanPro
         repetitions=int(request.repetitions) or settings.repetitions,
         weights=list(request.test_pose_weights) or None,
         sigma=sigma or settings.sigma,
-        criterion=request.criterion or settings.criterion,
+        criterion=criterion,
+        constraints=constraints_of(settings, robot),
+        candidates=candidates,
+        discrepancy=ModelDiscrepancy() if real else None,
         starts=settings.starts,
         seed=int(request.seed),
         time_limit=limit or settings.time_limit,
     )
 
 
-def _robot(request: Any, settings: PlannerParameters, own: Robot) -> Robot:
+def constraints_of(settings: PlannerParameters, robot: Robot) -> tuple[Constraint, ...]:
+    """Those of the file that the node's parameters name.
+
+    Raises:
+        InputError: The name leaves the folder, or the file does not fit the robot.
+    """
+    if not settings.constraints:
+        return ()
+    folder = settings.constraints_folder
+    path = file_in(Path(folder).expanduser() if folder else config_folder(), settings.constraints, "constraints")
+    return read_constraints(path, robot)
+
+
+def file_in(folder: Path, name: str, field: str) -> Path:
+    """The file ``name`` directly in ``folder``; parameters may be set by anyone, and no path leads out of it.
+
+    Raises:
+        InputError: Not the plain name of an existing file there.
+    """
+    path = folder / Path(name).name
+    plain = bool(name) and path.name == name and name not in (".", "..") and "\0" not in name
+    if not plain or path.resolve().parent != folder.resolve() or not path.is_file():
+        raise InputError(field, ascii(name[:100]), f"the name of a file in {folder}")
+    return path
+
+
+def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> FloatArray | None:
+    if not len(request.candidates):
+        return None
+    rows = check_rows("candidates", request.candidates, robot.joint_names)
+    if len(rows) > settings.most_candidates:
+        advice = "raise the node's parameter most_candidates if you mean it"
+        raise InputError("candidates", f"{len(rows)} rows", f"at most {settings.most_candidates}", advice)
+    return rows
+
+
+def _model(request: Any, settings: PlannerParameters, own: Model | NotReady) -> Model:
     names = list(request.parameters)
     if len(names) > MOST_PARAMETERS:
         raise InputError("parameters", f"{len(names)} names", f"at most {MOST_PARAMETERS}")
     wanted = names or settings.parameters
-    if request.robot in ("", own.name):
-        unknown = [w.strip() for w in settings.unknown.split(",") if w.strip()]
-        return own.with_parameters(wanted, unknown)
-    return load_shipped(request.robot, wanted, settings.unknown)
+    if isinstance(own, Model) and request.robot in ("", own.robot.name):
+        robot = own.robot.with_parameters(wanted, unknown_words(settings.unknown))
+        return Model(robot, own.speeds, own.described)
+    if not request.robot and isinstance(own, NotReady):
+        raise own
+    return shipped_model(request.robot, wanted, settings.unknown)
 
 
 def _shortened(text: str) -> str:

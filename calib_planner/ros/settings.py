@@ -7,33 +7,66 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from calib_planner.design.criteria import CRITERIA
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.instrument.standstill import StandstillSettings
-from calib_planner.robot.catalogue import shipped_robots
+from calib_planner.robot.catalogue import config_folder, shipped_robots
 from calib_planner.robot.chain import Robot
+from calib_planner.ros.lifecycle import LifecycleParameters
 from calib_planner.ros.parameters import parameter
+from calib_planner.simulation.faults import Faults
 
 ROBOT = "shipped robot name"
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas"
 
 
+def shipped_instruments() -> tuple[str, ...]:
+    """Names of the instruments in config/instruments, sorted."""
+    return tuple(sorted(p.stem for p in (config_folder() / "instruments").glob("*.yaml")))
+
+
 @dataclass(frozen=True)
-class PlannerParameters:
+class PlannerParameters(LifecycleParameters):
     """Parameters of ``calibration_planner``."""
 
-    robot: str = parameter("kuka_kr270", ROBOT, read_only=True)
+    robot: str = parameter("kuka_kr270", ROBOT + "; empty = only robot_description", at_configure=True)
+    use_robot_description: bool = parameter(
+        True, "a URDF heard on robot_description replaces robot", at_configure=True
+    )
+    base_link: str = parameter(
+        "", "robot_description: first link of the chain; empty = the root", at_configure=True
+    )
+    tip_link: str = parameter("", "robot_description: last link; empty = the only tip", at_configure=True)
     parameters: str = parameter("lengths+offsets", LEVEL)
     unknown: str = parameter("", "what else is unknown: base, tool or base,tool")
-    criterion: str = parameter("test_pose", "what is optimised, unless the request says otherwise")
+    criterion: str = parameter(
+        "test_pose", "what is optimised, unless the request says otherwise", choices=CRITERIA
+    )
     configurations: int = parameter(12, "configurations of a plan, unless the request says", low=1, high=10000)
     repetitions: int = parameter(1, "measurements at each configuration", low=1, high=10000)
     sigma: float = parameter(3e-5, "noise of one measured coordinate", unit="m", low=1e-9, high=1.0)
     starts: int = parameter(64, "random starts of the search", low=1, high=100000)
     time_limit: float = parameter(60.0, "longest search", unit="s", low=0.01, high=86400.0)
     most_configurations: int = parameter(200, "largest plan that is accepted", low=1, high=10000)
-    most_test_poses: int = parameter(1000, "most test poses that are accepted", low=1, high=100000)
-    joint_speed: float = parameter(1.0, "joint speed of ~/trajectory", unit="rad/s", low=1e-3, high=100.0)
+    most_test_poses: int = parameter(1000, "most test poses that are accepted", low=1, high=10000)
+    most_candidates: int = parameter(2000, "most candidates that are accepted", low=1, high=10000)
+    constraints: str = parameter(
+        "", "what may be measured: a file in constraints_folder; empty = joint limits only", at_configure=True
+    )
+    constraints_folder: str = parameter("", "folder of constraints; empty = the package's config", read_only=True)
+    joint_speed: float = parameter(
+        0.5, "~/trajectory: largest speed of turning joints", unit="rad/s", low=1e-3, high=100.0
+    )
+    slide_speed: float = parameter(
+        0.1, "~/trajectory: largest speed of sliding joints", unit="m/s", low=1e-4, high=100.0
+    )
+    dwell: float = parameter(5.0, "~/trajectory: standing still per measurement", unit="s", low=0.0, high=3600.0)
     frame_id: str = parameter("base_link", "frame of the robot's base")
+
+    def __post_init__(self) -> None:
+        for word in unknown_words(self.unknown):
+            if word not in ("base", "tool"):
+                raise UnknownNameError("unknown", word[:100], ("base", "tool"))
 
 
 @dataclass(frozen=True)
@@ -108,30 +141,40 @@ class IdentifierParameters:
 
 
 @dataclass(frozen=True)
-class SimulatorParameters:
-    """Parameters of ``tracker_simulator``."""
+class SimulatorParameters(LifecycleParameters, Faults):
+    """Parameters of ``tracker_simulator``; what goes wrong is inherited, see ``Faults``."""
 
-    robot: str = parameter("kuka_kr270", ROBOT, read_only=True)
-    parameters: str = parameter("lengths+offsets", "which have true errors: a level or names", read_only=True)
-    seed: int = parameter(0, "seed of the true errors and the noise", low=0, high=2**31 - 1, read_only=True)
+    robot: str = parameter("kuka_kr270", ROBOT, at_configure=True)
+    parameters: str = parameter("lengths+offsets", "which have true errors: a level or names", at_configure=True)
+    seed: int = parameter(0, "seed of all that is drawn", low=0, high=2**31 - 1, at_configure=True)
     length_error: float = parameter(
-        1e-3, "standard deviation of the true errors of lengths", unit="m", low=0.0, high=1.0, read_only=True
+        1e-3, "standard deviation of the true errors of lengths", unit="m", low=0.0, high=1.0, at_configure=True
     )
     angle_error: float = parameter(
-        1e-3, "standard deviation of the true errors of angles", unit="rad", low=0.0, high=1.0, read_only=True
+        1e-3, "standard deviation of the true errors of angles", unit="rad", low=0.0, high=1.0, at_configure=True
     )
     true_deviations: str = parameter(
-        "", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]", read_only=True
+        "", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]", at_configure=True
     )
-    sigma: float = parameter(3e-5, "noise of one coordinate of a tracker point", unit="m", low=0.0, high=1.0)
-    joint_rate: float = parameter(100.0, "rate of joint_states", unit="Hz", low=1.0, high=1000.0, read_only=True)
+    sigma: float = parameter(
+        3e-5, "noise of one coordinate of a tracker point", unit="m", low=0.0, high=1.0, at_configure=True
+    )
+    instrument: str = parameter(
+        "sigma",
+        "the tracker's noise: sigma alike, or a shipped instrument",
+        choices=("sigma", *shipped_instruments()),
+        at_configure=True,
+    )
+    joint_rate: float = parameter(
+        100.0, "rate of joint_states", unit="Hz", low=1.0, high=1000.0, at_configure=True
+    )
     tracker_rate: float = parameter(
-        50.0, "rate of tracker points", unit="Hz", low=0.1, high=1000.0, read_only=True
+        50.0, "rate of tracker points", unit="Hz", low=0.1, high=1000.0, at_configure=True
     )
     joint_speed: float = parameter(6.0, "largest joint speed", unit="rad/s", low=1e-3, high=100.0)
     dwell: float = parameter(0.8, "standing still per measurement", unit="s", low=0.0, high=600.0)
-    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", read_only=True)
-    frame_id: str = parameter("tracker", "frame of the tracker's points", read_only=True)
+    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", at_configure=True)
+    frame_id: str = parameter("tracker", "frame of the tracker's points", at_configure=True)
 
     def deviations(self, names: Sequence[str]) -> dict[str, float]:
         """``true_deviations`` by parameter name; refuses names not in ``names`` and values not finite."""
@@ -150,6 +193,11 @@ class SimulatorParameters:
         return result
 
 
+def unknown_words(text: str) -> list[str]:
+    """The words between the commas of a parameter ``unknown``."""
+    return [w.strip() for w in text.split(",") if w.strip()]
+
+
 def load_shipped(
     name: str, parameters: str | Sequence[str], unknown: str = "", targets: int | None = None
 ) -> Robot:
@@ -161,7 +209,7 @@ def load_shipped(
     if name not in shipped_robots():
         raise UnknownNameError("robot", name, shipped_robots())
     robot = Robot.load(name)
-    words = [w.strip() for w in unknown.split(",") if w.strip()]
+    words = unknown_words(unknown)
     if targets is not None and targets != len(robot.targets):
         if "tool" not in words:
             expected = f"{len(robot.targets)} topics, as the robot has targets"

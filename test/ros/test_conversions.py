@@ -86,15 +86,6 @@ def test_bad_plans_are_refused(message: PlanMessage, field: str, value: object) 
     assert caught.value.field == field
 
 
-def test_trajectory_respects_the_speed(planned: Plan) -> None:
-    path = c.trajectory_message(planned, 0.5, 0, "base")
-    times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in path.points]
-    q = np.array([p.positions for p in path.points])
-    assert np.array_equal(q, planned.configurations)
-    moved = np.abs(np.diff(q, axis=0)).max(axis=1)
-    assert (moved <= 0.5 * np.diff(times) + 1e-9).all()
-
-
 def joint_state(**values: float) -> JointState:
     return JointState(name=list(values), position=list(values.values()))
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
+import subprocess
+import sys
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +18,7 @@ from rclpy.parameter import Parameter
 
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot.catalogue import config_folder
+from calib_planner.ros import parameter_yaml
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.parameters import descriptor
 from calib_planner.ros.planner_node import PlannerNode
@@ -32,8 +37,15 @@ NODES = [
 ]
 
 
+@pytest.mark.parametrize("name", parameter_yaml.NODES)
+def test_the_yaml_is_what_the_dataclass_says(name: str) -> None:
+    text = (config_folder() / f"{name}.yaml").read_text()
+    assert text == parameter_yaml.yaml_text(name), "run: python -m calib_planner.ros.parameter_yaml"
+
+
 @pytest.mark.parametrize(("name", "kind", "_node"), NODES)
 def test_yaml_holds_every_parameter_at_its_default(name: str, kind: Any, _node: Any) -> None:
+    assert parameter_yaml.NODES[name][0] is kind
     path = config_folder() / f"{name}.yaml"
     values = yaml.safe_load(path.read_text())["/**"]["ros__parameters"]
     wanted = {f.name: getattr(kind(), f.name) for f in fields(kind)}
@@ -69,7 +81,11 @@ def test_nodes_take_the_yaml(bench: Bench, name: str, kind: Any, node: Any) -> N
         ("sigma", -1.0, "range"),
         ("sigma", float("nan"), "range|finite"),
         ("configurations", 0, "range"),
-        ("robot", "kuka_kr270", "read-only"),
+        ("robot", "kuka_kr270", "deactivate and cleanup"),
+        ("autostart", False, "read-only"),
+        ("unknown", "everything", "base, tool"),
+        ("criterion", "none", "test_pose"),
+        ("criterion", "x" * 100_000, "at most|one of"),
         ("sigma", "a", "[Ww]rong parameter type|type"),
     ],
 )
@@ -92,9 +108,9 @@ def test_good_values_are_followed(bench: Bench) -> None:
     ("node", "values"),
     [
         (PlannerNode, {"sigma": 7.0}),
-        (PlannerNode, {"robot": "none"}),
-        (PlannerNode, {"robot": "/etc/passwd"}),
-        (PlannerNode, {"parameters": "none"}),
+        (PlannerNode, {"sigma": 1}),
+        (PlannerNode, {"sigma": math.nan}),
+        (PlannerNode, {"unknown": "everything"}),
         (PlannerNode, {"sigma": "a"}),
         (IdentifierNode, {"minimum_samples": 30}),
         (IdentifierNode, {"tracker_topics": ["a", "b"]}),
@@ -107,6 +123,50 @@ def test_a_bad_start_is_refused(bench: Bench, node: Any, values: dict[str, Any])
     with pytest.raises((InputError, ParameterException)) as caught:
         bench.start(node, **values)
     assert str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("robt", "planar_2r", ["robt", "did you mean 'robot'"]),
+        ("Sigma", 1e-5, ["Sigma", "did you mean 'sigma'"]),
+        ("sigma", 1, ["sigma", "a number with a decimal point", "write 1.0"]),
+        ("sigma", 7.0, ["sigma", "7.0", "1e-09 to 1 m"]),
+        ("configurations", 0, ["configurations", "0", "1 to 10000"]),
+        ("criterion", "dd", ["criterion", "did you mean 'd'"]),
+        ("qos_override./a.publisher.depth", 3, ["qos_override", "valid names"]),
+        ("use_sim_tim", True, ["did you mean 'use_sim_time'"]),
+    ],
+)
+def test_a_bad_start_says_what_is_wrong(bench: Bench, name: str, value: Any, words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        bench.start(PlannerNode, **{name: value})
+    assert all(word in str(caught.value) for word in words), caught.value
+
+
+def test_what_ros_declares_itself_is_allowed(bench: Bench) -> None:
+    others = {
+        "use_sim_time": True,
+        "start_type_description_service": False,
+        "qos_overrides./x.publisher.depth": 3,
+    }
+    node = bench.start(PlannerNode, robot="planar_2r", **others)
+    assert node.is_active and node.get_parameter("use_sim_time").value
+
+
+@pytest.mark.parametrize("values", [{"robot": "none"}, {"robot": "/etc/passwd"}, {"parameters": "none"}])
+def test_what_cannot_be_configured_is_said(bench: Bench, values: dict[str, Any]) -> None:
+    node = bench.start(PlannerNode, **values)
+    assert node.state == "unconfigured" and next(iter(values)) in node.failure
+
+
+def test_a_file_with_an_unknown_name_ends_the_process(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("/**:\n  ros__parameters:\n    sigm: 0.001\n")
+    command = [sys.executable, "-m", "calib_planner.ros.planner_node", "--ros-args", "--params-file", str(path)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+    assert ended.returncode == 1 and "did you mean 'sigma'" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def test_given_deviations() -> None:

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.srv import PlanCalibration
+from robots import random_configurations
 
-from calib_planner import Robot
+from calib_planner import PlanProblem, Robot, plan
+from calib_planner.errors import InputError
+from calib_planner.ros.model_source import NotReady, described_model, shipped_model
 from calib_planner.ros.planning import answer
-from calib_planner.ros.settings import PlannerParameters, load_shipped
+from calib_planner.ros.settings import PlannerParameters
 
 SETTINGS = PlannerParameters(robot="planar_2r", starts=4, configurations=4, most_configurations=50)
-OWN = load_shipped("planar_2r", "lengths+offsets")
+OWN = shipped_model("planar_2r", "lengths+offsets", "")
 POSE = [0.3, 0.5]
 
 BAD: list[tuple[dict[str, Any], str, str]] = [
@@ -45,6 +51,11 @@ BAD: list[tuple[dict[str, Any], str, str]] = [
     ({"sigma": 5.0}, "INVALID_REQUEST", "sigma"),
     ({"time_limit": -1.0}, "INVALID_REQUEST", "time_limit"),
     ({"time_limit": math.inf}, "INVALID_REQUEST", "time_limit"),
+    ({"candidates": [0.1, 0.2, 0.3]}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": [0.1, math.nan] * 9}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": [0.1, 0.2]}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": [0.1, 0.2] * 2001}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": [0.1] * 100_000}, "INVALID_REQUEST", "candidates"),
     ({"configurations": 1}, "INFEASIBLE", "configurations"),
 ]
 
@@ -82,3 +93,125 @@ def test_cancelling_returns_the_best_so_far() -> None:
     found = answer(goal, SETTINGS, OWN, lambda state: state.starts_done > 0)
     assert found.status == "CANCELLED" and found.plan is not None
     assert hasattr(PlanAction.Result, found.status)
+
+
+def test_it_is_the_library_s_plan() -> None:
+    request = PlanCalibration.Request(test_poses=POSE, seed=9)
+    found = answer(request, SETTINGS, OWN)
+    wanted = plan(PlanProblem(OWN.robot, [POSE], 4, sigma=SETTINGS.sigma, starts=4, seed=9))
+    assert found.plan is not None
+    np.testing.assert_array_equal(found.plan.configurations, wanted.configurations)
+    assert found.plan.predicted_accuracy == wanted.predicted_accuracy
+
+
+def test_candidates_are_chosen_among() -> None:
+    pool = random_configurations(OWN.robot, 40, 3)
+    request = PlanCalibration.Request(test_poses=POSE, candidates=pool.ravel().tolist())
+    found = answer(request, SETTINGS, OWN).plan
+    assert found is not None
+    assert all((pool == q).all(axis=1).any() for q in found.configurations)
+    assert len(np.unique(found.configurations, axis=0)) == 4
+
+
+def test_without_a_robot_only_shipped_ones() -> None:
+    nobody = NotReady("no robot yet: publish one")
+    found = answer(PlanCalibration.Request(test_poses=POSE), SETTINGS, nobody)
+    assert (found.status, found.field) == ("NOT_READY", "robot") and "publish one" in found.message
+    found = answer(PlanCalibration.Request(test_poses=POSE, robot="planar_2r"), SETTINGS, nobody)
+    assert found.status == "SUCCESS"
+
+
+# ── constraints ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def with_constraints(folder: Path, name: str) -> PlannerParameters:
+    return replace(SETTINGS, constraints_folder=str(folder), constraints=name)
+
+
+def test_constraints_are_kept(tmp_path: Path) -> None:
+    joint = OWN.robot.joint_names[1]
+    (tmp_path / "cell.yaml").write_text(f"joint_range: {{{joint}: [0.2, 0.4]}}\n")
+    found = answer(PlanCalibration.Request(test_poses=POSE), with_constraints(tmp_path, "cell.yaml"), OWN).plan
+    assert found is not None
+    assert (found.configurations[:, 1] >= 0.2).all() and (found.configurations[:, 1] <= 0.4).all()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../secret.yaml", "/etc/passwd", "sub/../cell.yaml", "..", ".", "link.yaml", "none.yaml", "a\0b", "sub"],
+)
+def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "folder"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "secret.yaml").write_text("password: 1\n")
+    (folder / "cell.yaml").write_text("workspace: {low: [-9, -9, -9], high: [9, 9, 9]}\n")
+    (folder / "link.yaml").symlink_to(tmp_path / "secret.yaml")
+    found = answer(PlanCalibration.Request(test_poses=POSE), with_constraints(folder, name), OWN)
+    assert (found.status, found.field) == ("INVALID_REQUEST", "constraints")
+    assert "password" not in found.message and "root:" not in found.message
+
+
+def test_a_file_with_tags_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "cell.yaml").write_text("workspace: !!python/object/apply:os.system ['touch /tmp/never']\n")
+    found = answer(PlanCalibration.Request(test_poses=POSE), with_constraints(tmp_path, "cell.yaml"), OWN)
+    assert found.status == "INVALID_REQUEST" and "cell.yaml" in found.message
+
+
+# ── robots from the wire ─────────────────────────────────────────────────────────────────────────────
+
+
+def urdf(joints: int, *, inside: str = "", limit: str = 'velocity="2.0"') -> str:
+    """A chain of turning joints."""
+    links = "".join(f'<link name="l{i}"/>' for i in range(joints + 1))
+    axes = ("0 0 1", "0 1 0", "1 0 0")
+    parts = "".join(
+        f'<joint name="j{i}" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        f'<origin xyz="0.1 0 0.4"/><axis xyz="{axes[i % 3]}"/><limit lower="-2" upper="2" {limit}/></joint>'
+        for i in range(joints)
+    )
+    return f'<robot name="wire">{links}{parts}{inside}</robot>'
+
+
+def test_a_described_robot_is_planned_for() -> None:
+    model = described_model(urdf(3))
+    assert model.described and model.speeds.tolist() == [2.0] * 3
+    found = answer(PlanCalibration.Request(test_poses=[0.1, 0.2, 0.3]), SETTINGS, model)
+    assert found.status == "SUCCESS" and found.plan is not None and found.plan.joint_names == ("j0", "j1", "j2")
+    assert np.isinf(described_model(urdf(3, limit="")).speeds).all()
+
+
+def test_the_chain_is_chosen() -> None:
+    assert described_model(urdf(5), "l1", "l4").robot.joint_names == ("j1", "j2", "j3")
+    with pytest.raises(InputError, match="tip_link"):
+        described_model(urdf(5), "l1", "none")
+
+
+BOMB = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 10))
+HOSTILE = {
+    "empty": "",
+    "no XML": "hello",
+    "NUL": urdf(2).replace("wire", "wi\0re"),
+    "bomb": f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]>' + urdf(2).replace("wire", "&a9;"),
+    "external": '<!DOCTYPE r [<!ENTITY e SYSTEM "file:///etc/passwd">]>' + urdf(2).replace("wire", "&e;"),
+    "hidden": '<?xml version="1.0" encoding="utf-7"?>+ADwAIQ-DOCTYPE r>' + urdf(2),
+    "joints": urdf(10_000),
+    "chain": urdf(200),
+    "size": urdf(2, inside="<!-- " + "x" * 5_000_000 + " -->"),
+    "depth": "<robot>" + "<a>" * 200_000 + "</a>" * 200_000 + "</robot>",
+    "open": "<robot>" + "<a>" * 200_000,
+    "numbers": urdf(2).replace('xyz="0.1 0 0.4"', 'xyz="nan 0 1e999"'),
+    "limits": urdf(2).replace('lower="-2"', 'lower="3"'),
+    "name": urdf(2).replace('name="wire"', f'name="{"x" * 5000}"'),
+    "control": urdf(2).replace('name="wire"', 'name="a&#10;b"'),
+    "doubled": urdf(2).replace('name="j1"', 'name="j0"'),
+    "xacro": urdf(2, inside='<xacro:include filename="/etc/passwd"/>'),
+    "loop": urdf(2, inside='<joint name="x" type="fixed"><parent link="l2"/><child link="l0"/></joint>'),
+    "velocity": urdf(2, limit='velocity="fast"'),
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_description_is_refused_with_a_reason(text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        described_model(text)
+    assert "robot_description" in str(caught.value) and "root:" not in str(caught.value)

@@ -1,0 +1,135 @@
+"""A plan for the eye: RViz markers of the robot at every configuration, the targets, their order and the path.
+
+The robot is a skeleton: base, the joints' origins, the tip, and a line to each target. A marker holds all
+skeletons, so that a plan of any size is a handful of markers and one text per configuration, of which there are
+MOST_SHOWN at most: of a larger plan every n-th is drawn. Positions are in the frame of
+``Robot.positions``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import Point, Vector3
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.design.plan import Plan
+from calib_planner.robot.capsules import segments
+from calib_planner.robot.chain import Robot
+from calib_planner.ros.conversions import stamp_message
+
+MOST_SHOWN = 50
+"""Configurations, and test poses, that are drawn at most."""
+BONE, JOINT, TARGET, TEXT, PATH = 0.012, 0.03, 0.05, 0.08, 0.006
+"""Sizes, as a share of the largest extent of what is drawn [1]."""
+FIRST, LAST = np.array([0.17, 0.45, 0.70, 0.9]), np.array([0.99, 0.68, 0.38, 0.9])
+"""Colours from the first to the last configuration, red, green, blue, opacity."""
+TESTS = np.array([0.84, 0.15, 0.16, 1.0])
+
+
+def plan_markers(plan: Plan, robot: Robot, stamp: int, frame_id: str) -> MarkerArray:
+    """The markers, the first of which deletes those of the plan before.
+
+    Args:
+        plan: Its configurations [rad | m].
+        robot: The robot it is for.
+        stamp: Of the headers [ns].
+        frame_id: The frame in which ``robot.positions`` are.
+    """
+    shown = _shown(len(plan.configurations))
+    bones, nodes, targets = skeletons(robot, plan.configurations[shown])
+    size = float(np.ptp(nodes.reshape(-1, 3), axis=0).max()) or 1.0
+    colours = _shades(len(shown))
+    centres = targets.mean(axis=1)
+    markers = [
+        Marker(action=Marker.DELETEALL),
+        _lines("robot", bones, colours, BONE * size),
+        _spheres("joints", nodes, colours, JOINT * size),
+        _spheres("targets", targets, colours, TARGET * size),
+    ]
+    if len(shown) > 1:
+        markers.append(_marker("path", Marker.LINE_STRIP, centres, colours, Vector3(x=PATH * size)))
+    markers += [
+        _text(str(i + 1), k, at, TEXT * size)
+        for k, (i, at) in enumerate(zip(shown.tolist(), centres, strict=True))
+    ]
+    if len(plan.test_poses):
+        poses = plan.test_poses[_shown(len(plan.test_poses))]
+        bones, _, targets = skeletons(robot, poses)
+        red = np.tile(TESTS, (len(poses), 1))
+        markers += [
+            _lines("test_poses", bones, red, BONE * size),
+            _spheres("test_targets", targets, red, TARGET * size),
+        ]
+    for marker in markers:
+        marker.header.stamp, marker.header.frame_id = stamp_message(stamp), frame_id
+    return MarkerArray(markers=markers)
+
+
+def skeletons(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where the robot is at N configurations ``q`` (N, joints) [rad | m].
+
+    Returns:
+        Lines (N, 2·B, 3), ends of line b at 2b and 2b + 1; base, joints and tip (N, joints + 2, 3);
+        targets (N, T, 3) [m].
+    """
+    posture = robot.posture(q)
+    start, end = segments(robot, posture)
+    tip = np.broadcast_to(posture.tip_origin[:, None], posture.targets.shape)
+    lines = np.stack([np.concatenate([start, tip], 1), np.concatenate([end, posture.targets], 1)], axis=2)
+    nodes = np.concatenate([start, end[:, -1:]], axis=1)
+    return lines.reshape(len(q), -1, 3), nodes, posture.targets
+
+
+def _shown(count: int) -> IntArray:
+    """Rows that are drawn: all, or MOST_SHOWN spread evenly with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_SHOWN)).round().astype(np.int64))
+
+
+def _shades(count: int) -> FloatArray:
+    """(count, 4) from FIRST to LAST."""
+    share = np.linspace(0, 1, count)[:, None]
+    return (1 - share) * FIRST + share * LAST
+
+
+def _lines(name: str, points: FloatArray, colours: FloatArray, width: float) -> Marker:
+    return _marker(name, Marker.LINE_LIST, *_flat(points, colours), Vector3(x=width))
+
+
+def _spheres(name: str, points: FloatArray, colours: FloatArray, size: float) -> Marker:
+    return _marker(name, Marker.SPHERE_LIST, *_flat(points, colours), Vector3(x=size, y=size, z=size))
+
+
+def _flat(points: FloatArray, colours: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(N, K, 3) and (N, 4) as rows (N·K, 3) and (N·K, 4)."""
+    return points.reshape(-1, 3), np.repeat(colours, points.shape[1], axis=0)
+
+
+def _marker(name: str, kind: int, points: FloatArray, colours: FloatArray, scale: Vector3) -> Marker:
+    marker = Marker(ns=name, type=kind, scale=scale, color=_colour(colours[0]))
+    marker.pose.orientation.w = 1.0
+    marker.points = [_point(row) for row in points.tolist()]
+    marker.colors = [_colour(row) for row in colours.tolist()]
+    return marker
+
+
+def _text(text: str, number: int, at: FloatArray, size: float) -> Marker:
+    marker = Marker(ns="order", id=number, type=Marker.TEXT_VIEW_FACING, text=text)
+    marker.scale.z = size
+    marker.color = _colour([1.0, 1.0, 1.0, 1.0])
+    marker.pose.orientation.w = 1.0
+    marker.pose.position = _point([at[0], at[1], at[2] + size])
+    return marker
+
+
+def _point(row: Sequence[float]) -> Point:
+    x, y, z = map(float, row)
+    return Point(x=x, y=y, z=z)
+
+
+def _colour(row: Sequence[float]) -> ColorRGBA:
+    r, g, b, a = map(float, row)
+    return ColorRGBA(r=r, g=g, b=b, a=a)
