@@ -147,7 +147,7 @@ def joint_charts(report: CalibrationReport) -> list[str]:
     """A chart per joint: the residual's parts against the joint's coordinate."""
     robot, e, data = report.estimate.calibrated, report.estimate, report.problem.data
     use = data.seen & (point_states(e) != REJECTED)
-    parts = _joint_parts(report)
+    parts = joint_residuals(report)
     shown = 1e3 * np.abs(np.where(use[None, :, :, None], parts, 0.0))
     highest = float(np.nanmax(shown, initial=0.0)) or 1.0
     where = np.argwhere(use)
@@ -183,7 +183,7 @@ def _means(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
 
 
-def _joint_parts(report: CalibrationReport) -> FloatArray:
+def joint_residuals(report: CalibrationReport) -> FloatArray:
     """(joints, N, targets, 3) residual along the joint's motion, its axis, across [m]; NaN: no direction."""
     robot, data, residuals = report.estimate.calibrated, report.problem.data, report.estimate.residuals
     n, targets = data.seen.shape

@@ -77,7 +77,7 @@ def report_page(report: CalibrationReport) -> str:
         most_pairs=MOST_PAIRS,
         strong=STRONG,
         css=_file("calibration.css"),
-        scripts=[_file("calibration_view.js"), _file("calibration_table.js")],
+        scripts=[_file(f"calibration_{name}.js") for name in ("view", "controls", "table")],
         json_text=embedded(data),
     )
 
