@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from calib_planner._arrays import FloatArray, IntArray, check_array, check_count, check_number, frozen
 from calib_planner.errors import InputError
+from calib_planner.instrument.clock_offset import ClockOffsets
 from calib_planner.instrument.stamp_order import StampOrder
 
 NANO = 1_000_000_000
@@ -154,11 +155,13 @@ class _Window:
         """Range, largest over the coordinates, were ``value`` to join."""
         return float(np.max(np.maximum(self._high, value) - np.minimum(self._low, value)))
 
-    def push(self, stamp: int, value: FloatArray) -> None:
-        """Take a sample; one that breaks the rest begins a new one."""
+    def push(self, stamp: int, value: FloatArray) -> tuple[int, int] | None:
+        """Take a sample; one that breaks the rest begins a new one, and gives the old one's interval [ns]."""
+        ended = None
         if self.on_time(stamp) and self.spread_with(value) <= self.tolerance:
             self._low, self._high = np.minimum(self._low, value), np.maximum(self._high, value)
         else:
+            ended = (self.since, self.last) if self.samples else None
             self.samples.clear()
             self._low = self._high = value
             self.since = stamp
@@ -166,6 +169,7 @@ class _Window:
         self.samples.append((stamp, value))
         while self.samples[0][0] < stamp - self.horizon:
             self.samples.popleft()
+        return ended
 
     def between(self, start: int, stop: int) -> FloatArray:
         """(samples, n) values with stamps in [start, stop]."""
@@ -190,7 +194,9 @@ class StandstillDetector:
         horizon, gap = _ns(s.settle + max(s.patience, s.duration) + s.gap), _ns(s.gap)
         self._joints = _Window(s.joint_tolerance, gap, horizon)
         self._targets = [_Window(s.point_tolerance, gap, horizon) for _ in range(targets)]
+        self.clocks = ClockOffsets(targets, _ns(s.skew), _ns(s.duration) // 2)
         self._measured: FloatArray | None = None
+        self._rest = (0, 0)  # stamps of the rest in which something was measured, so far
         self._complained = False
         self._saw_nan = False
         self._nan_in_a_row = [0] * (1 + targets)
@@ -210,9 +216,20 @@ class StandstillDetector:
     def flush(self) -> list[Standstill | Rejection]:
         """Take what still waits, and the last standstill as ended: the end of a recording."""
         results = self._process(everything=True) + self._ended()
+        self.clocks.clear()
         self._joints.samples.clear()
         self._measured = None
         return results
+
+    def offset_text(self, bound: float) -> str:
+        """In words, which target's stamps are more than ``bound`` [s] from the joints'; empty if none are."""
+        for k in range(self.target_count):
+            offset = self.clocks.offset(k)
+            if offset is not None and offset.exceeds(bound):
+                text = f"target {k + 1} is stamped {1e3 * offset.seconds:+.0f} ms from the joints"
+                by = f"by when both stopped and started at {offset.standstills} standstills"
+                return f"{text}, {by}, {1e3 * bound:.0f} ms are allowed: synchronise the clocks"
+        return ""
 
     @property
     def dropped(self) -> tuple[int, ...]:
@@ -241,7 +258,7 @@ class StandstillDetector:
         results: list[Standstill | Rejection] = []
         for stamp, stream, value in self._order.ready(everything=everything):
             if stream:
-                self._on_point(self._targets[stream - 1], stamp, value)
+                self._on_point(stream - 1, stamp, value)
             else:
                 results += self._on_joints(stamp, value)
             results += self._complete(stamp)
@@ -251,10 +268,13 @@ class StandstillDetector:
         joints, results = self._joints, []
         if self._measured is not None:
             if np.max(np.abs(value - self._measured)) <= joints.tolerance:
+                self._rest = (self._rest[0], stamp)
                 return []
+            self.clocks.add_joints(*self._rest)
             self._measured = None
             joints.samples.clear()
         elif joints.samples and not (joints.on_time(stamp) and joints.spread_with(value) <= joints.tolerance):
+            self.clocks.add_joints(joints.since, joints.last)
             results = self._ended()
             joints.samples.clear()
         if not joints.samples:
@@ -264,13 +284,15 @@ class StandstillDetector:
         joints.push(stamp, value)
         return results
 
-    def _on_point(self, window: _Window, stamp: int, value: FloatArray) -> None:
+    def _on_point(self, target: int, stamp: int, value: FloatArray) -> None:
+        window = self._targets[target]
         at_rest = self._joints.samples and stamp >= self._joints.since + _ns(self.settings.settle)
         if at_rest and self._measured is None and window.on_time(stamp):
             spread = window.spread_with(value)
             if spread > window.tolerance:
                 window.moved_by = max(window.moved_by, spread)
-        window.push(stamp, value)
+        if (rest := window.push(stamp, value)) is not None:
+            self.clocks.add_point(target, *rest)
 
     # ── the decision ─────────────────────────────────────────────────────────────────────────────────
 
@@ -310,6 +332,7 @@ class StandstillDetector:
 
     def _take(self, found: Standstill) -> list[Standstill | Rejection]:
         self._measured = found.joints
+        self._rest = (self._joints.since, self._joints.last)
         self._joints.samples.clear()
         return [found]
 

@@ -1,0 +1,106 @@
+"""Do the clocks of joints and points agree? Seen from when each came to rest and when it moved on.
+
+A standstill is an interval [a, b] in the stamps of the joints and [a', b'] in those of a target. A clock that is
+τ ahead shifts both ends: a' − a = b' − b = τ. What else makes them differ (tolerances that are not passed at the
+same moment while the robot slows down and speeds up) has opposite signs at the two ends of a motion that is about
+as quick at its end as at its beginning, so the middles differ by τ and the lengths by what is doubtful:
+
+    τ = (a' + b')/2 − (a + b)/2,      doubt = |(b' − a') − (b − a)|/2
+
+The offset of a target is the median of its last standstills. A beam that was broken shortens the target's
+interval and shows as doubt, a target that did not move at all has none. An offset shorter than the time left out
+after coming to rest does no harm to means over standstills; one that is longer pairs points with the wrong joints.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from statistics import median
+
+NANO = 1_000_000_000
+REMEMBERED = 9
+"""Standstills that an offset is the median of."""
+FEWEST = 3
+"""Standstills without which there is no offset."""
+
+Interval = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How far a target's stamps are ahead of the joints'.
+
+    Attributes:
+        seconds: The offset [s]; positive: the points are stamped later than the joints.
+        doubt: How much of it may come from something else [s].
+        standstills: Number it rests on.
+    """
+
+    seconds: float
+    doubt: float
+    standstills: int
+
+    def exceeds(self, bound: float) -> bool:
+        """Whether it is beyond ``bound`` [s] whatever the doubt."""
+        return abs(self.seconds) - self.doubt > bound
+
+
+@dataclass
+class ClockOffsets:
+    """Fed with the rests of every stream, in the order in which they end.
+
+    Attributes:
+        targets: Number of targets.
+        reach: Largest difference of stamps that can belong to one standstill [ns].
+        shortest: Shorter rests are left out [ns].
+    """
+
+    targets: int
+    reach: int
+    shortest: int
+    _joints: deque[Interval] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _points: list[deque[Interval]] = field(default_factory=list)
+    _found: list[deque[Interval]] = field(default_factory=list)  # (offset, doubt) [ns]
+
+    def __post_init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything: a clock was set."""
+        self._joints.clear()
+        self._points = [deque(maxlen=REMEMBERED) for _ in range(self.targets)]
+        self._found = [deque(maxlen=REMEMBERED) for _ in range(self.targets)]
+
+    def add_joints(self, start: int, stop: int) -> None:
+        """The joints were at rest from ``start`` to ``stop`` [ns]."""
+        if stop - start >= self.shortest:
+            self._joints.append((start, stop))
+            for k, points in enumerate(self._points):
+                if (found := self._nearest((start, stop), points)) is not None:
+                    self._note(k, (start, stop), found)
+
+    def add_point(self, target: int, start: int, stop: int) -> None:
+        """A target, from 0, was at rest from ``start`` to ``stop`` [ns]."""
+        if stop - start >= self.shortest:
+            self._points[target].append((start, stop))
+            if (found := self._nearest((start, stop), self._joints)) is not None:
+                self._note(target, found, (start, stop))
+
+    def offset(self, target: int) -> Offset | None:
+        """The offset of a target, from 0; ``None`` as long as too little was seen."""
+        found = self._found[target]
+        if len(found) < FEWEST:
+            return None
+        seconds, doubt = (median(f[i] for f in found) / NANO for i in (0, 1))
+        return Offset(seconds, doubt, len(found))
+
+    def _nearest(self, rest: Interval, others: deque[Interval]) -> Interval | None:
+        """Which of the other stream's rests belongs to ``rest``."""
+        near = [o for o in others if max(abs(o[0] - rest[0]), abs(o[1] - rest[1])) <= self.reach]
+        return min(near, key=lambda o: abs(sum(o) - sum(rest)), default=None)
+
+    def _note(self, target: int, joints: Interval, points: Interval) -> None:
+        offset = (sum(points) - sum(joints)) // 2
+        doubt = abs((points[1] - points[0]) - (joints[1] - joints[0])) // 2
+        self._found[target].append((offset, doubt))

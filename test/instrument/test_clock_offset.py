@@ -1,0 +1,81 @@
+"""The clocks' offset out of when joints and points stand still, against offsets that were put in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_standstill import STOPS, feed, stream
+
+from calib_planner.instrument.clock_offset import FEWEST, ClockOffsets
+from calib_planner.instrument.standstill import NANO, StandstillDetector
+
+MANY = [*STOPS, *STOPS]
+
+
+@pytest.mark.parametrize("offset", [-0.4, -0.15, -0.02, 0.0, 0.02, 0.15, 0.4])
+@pytest.mark.parametrize("move", [0.5, 3.0])
+@pytest.mark.parametrize("rate", [50, 1000])
+def test_an_offset_is_found(offset: float, move: float, rate: int) -> None:
+    detector = StandstillDetector(2)
+    feed(detector, stream(MANY, 1, offset, point_rate=rate, move=move), flush=False)
+    found = detector.clocks.offset(0)
+    assert found is not None and found.standstills >= 5
+    assert abs(found.seconds - offset) < 0.5 / rate + 0.01 * move + 0.005
+    assert bool(detector.offset_text(0.1)) == (abs(offset) > 0.1)
+
+
+def test_the_text_says_which_way() -> None:
+    detector = StandstillDetector(2)
+    feed(detector, stream(MANY, 1, 0.2), flush=False)
+    assert "target 1" in detector.offset_text(0.1) and "+" in detector.offset_text(0.1)
+    detector = StandstillDetector(2)
+    feed(detector, stream(MANY, 1, -0.2), flush=False)
+    assert "-" in detector.offset_text(0.1)
+
+
+def test_targets_have_offsets_of_their_own() -> None:
+    messages = stream(MANY, 2, targets=2)
+    shifted = [(t + (NANO // 4 if k == 2 else 0), k, v) for t, k, v in messages]
+    detector = StandstillDetector(2, 2)
+    feed(detector, sorted(shifted, key=lambda m: m[0]), flush=False)
+    first, second = detector.clocks.offset(0), detector.clocks.offset(1)
+    assert first is not None and second is not None
+    assert abs(first.seconds) < 0.02 and abs(second.seconds - 0.25) < 0.02
+    assert "target 2" in detector.offset_text(0.1)
+
+
+def test_a_target_that_does_not_move_says_nothing() -> None:
+    messages = [(t, k, np.array([1.0, 2.0, 3.0]) if k else v) for t, k, v in stream(MANY)]
+    detector = StandstillDetector(2)
+    feed(detector, messages, flush=False)
+    assert detector.clocks.offset(0) is None and not detector.offset_text(0.001)
+
+
+def test_broken_beams_are_no_offset() -> None:
+    """The points begin 0.3 s after every stop: half of that in the middle, all of it doubtful."""
+    messages = [m for m in stream(MANY) if not (m[1] and m[0] / NANO % 1.5 < 0.3)]
+    detector = StandstillDetector(2)
+    feed(detector, messages, flush=False)
+    assert not detector.offset_text(0.05)
+
+
+def test_too_few_standstills_say_nothing() -> None:
+    clocks = ClockOffsets(1, NANO, 0)
+    for k in range(FEWEST):
+        assert clocks.offset(0) is None
+        clocks.add_joints(4 * k * NANO, (4 * k + 1) * NANO)
+        clocks.add_point(0, 4 * k * NANO + 300, (4 * k + 1) * NANO + 100)
+    found = clocks.offset(0)
+    assert found is not None and (found.seconds, found.doubt) == pytest.approx((200e-9, 100e-9))
+    clocks.clear()
+    assert clocks.offset(0) is None
+
+
+def test_synchronised_again_it_recovers() -> None:
+    clocks = ClockOffsets(1, NANO, 0)
+    for k in range(20):
+        shift = NANO // 3 if k < 10 else 0
+        clocks.add_point(0, 4 * k * NANO + shift, (4 * k + 1) * NANO + shift)
+        clocks.add_joints(4 * k * NANO, (4 * k + 1) * NANO)
+        found = clocks.offset(0)
+        assert found is None or found.exceeds(0.1) == (k < 14)
