@@ -1,7 +1,9 @@
 """Node ``tracker_simulator``: a robot with hidden true errors and a tracker that watches it.
 
-It publishes joint states (what the controller believes) and tracker points (where the true robot is, with
-noise), each stamped by the node's clock, and executes plans. The way it moves is in ``motion``.
+It publishes joint states (what the controller believes) and tracker points (where the true robot is seen), and
+executes plans as a real robot's node does (see docs/connecting.md). What the messages hold, and what goes wrong
+with them, is in ``simulation``: every tick asks there for what has arrived by now. A tick that comes late makes
+up for what it missed, so that a busy machine delays messages and loses none. The truth is never published.
 """
 
 from __future__ import annotations
@@ -13,29 +15,33 @@ from dataclasses import dataclass
 import numpy as np
 from calib_planner_msgs.action import ExecutePlan
 from geometry_msgs.msg import PointStamped
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from calib_planner._arrays import FloatArray
 from calib_planner.design.plan import Plan
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
-from calib_planner.instrument.standstill import NANO
+from calib_planner.files.instrument_yaml import read_instrument
+from calib_planner.robot.catalogue import config_folder
 from calib_planner.robot.chain import Robot
 from calib_planner.ros.conversions import joints_message, plan_from_message, point_message
-from calib_planner.ros.parameters import NodeParameters
+from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.qos import SENSOR_OUT
 from calib_planner.ros.run import run
 from calib_planner.ros.settings import SimulatorParameters, load_shipped
-from calib_planner.simulation import SimulatedCell, random_deviations
-from calib_planner.simulation.motion import Tour, make_tour
+from calib_planner.simulation import Itinerary, Rates, SimulatedCell, Streams, Tour, World, make_tour
+from calib_planner.simulation.cell import random_deviations
+from calib_planner.simulation.motion import NANO
 
 FEEDBACK_PERIOD = 0.1
 """Time between two looks at the execution [s]."""
+PATIENCE = 2.0
+"""Time that an execution gets to end when it is stopped [s]."""
+MOST_STANDSTILLS = 100_000
+"""Standstills of one plan; at a second each that is more than a day."""
 
 
 @dataclass(frozen=True)
@@ -50,69 +56,75 @@ class Execution:
         return (stamp - self.began) / NANO
 
 
-class SimulatorNode(Node):
-    """See the module."""
+class SimulatorNode(ManagedNode[SimulatorParameters]):
+    """See the module.
+
+    Attributes:
+        world: Robot, tracker and faults, once configured: for tests, which may know the truth.
+    """
 
     THREADS = 3
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        super().__init__("tracker_simulator", context=context, parameter_overrides=list(overrides))
-        self.settings = NodeParameters(self, SimulatorParameters())
-        chosen = self.settings.value
-        self._robot = load_shipped(chosen.robot, chosen.parameters)
-        if len(chosen.tracker_topics) != len(self._robot.targets):
-            expected = f"{len(self._robot.targets)} topics, as the robot has targets"
-            raise InputError("tracker_topics", f"{len(chosen.tracker_topics)} topics", expected)
-        self._truth = SimulatedCell(self._robot, true_deviations(self._robot, chosen)).truth
-        self._rng = np.random.default_rng([chosen.seed, 2])
-        self._rest: FloatArray = self._robot.joint_limits.mean(axis=1)
-        self._execution: Execution | None = None
         self._busy, self._closing = threading.Lock(), threading.Event()
+        super().__init__("tracker_simulator", SimulatorParameters(), context, overrides)
+
+    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
+
+    def configure(self) -> None:
+        """Draw the true errors, make the publishers."""
+        chosen = self.settings.value
+        self.world = make_world(chosen)
+        robot = self.world.robot
+        if len(chosen.tracker_topics) != len(robot.targets):
+            expected = f"{len(robot.targets)} topics, as the robot has targets"
+            raise InputError("tracker_topics", f"{len(chosen.tracker_topics)} topics", expected)
+        self._itinerary = Itinerary(robot.joint_limits.mean(axis=1))
         self._joint_publisher = self.create_publisher(JointState, "joint_states", SENSOR_OUT)
         self._point_publishers = [
             self.create_publisher(PointStamped, topic, SENSOR_OUT) for topic in chosen.tracker_topics
         ]
-        self._timers_of_streams = [
-            self.create_timer(1.0 / chosen.joint_rate, self._publish_joints),
-            self.create_timer(1.0 / chosen.tracker_rate, self._publish_points),
-        ]
-        self._action = ActionServer(
-            self,
+
+    def activate(self) -> None:
+        """Publish, and take plans."""
+        self._closing.clear()
+        chosen = self.settings.value
+        rates = Rates(chosen.joint_rate, chosen.tracker_rate)
+        self._streams = Streams(self.world, self._itinerary.at, rates, self._now())
+        self.create_timer(1.0 / max(chosen.joint_rate, chosen.tracker_rate), self._publish)
+        self.create_action_server(
             ExecutePlan,
             "~/execute_plan",
             self._on_goal,
             callback_group=ReentrantCallbackGroup(),
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
-        self.get_logger().info(f"{self._robot.name} with hidden errors stands still")
+        self.get_logger().info(f"{self.world.robot.name} with hidden errors stands still")
+
+    def deactivate(self) -> None:
+        """End an execution that is under way."""
+        self._closing.set()
+        if self._busy.acquire(timeout=PATIENCE):
+            self._busy.release()
 
     def close(self) -> bool:
-        """End an execution that is under way; whether it did within a moment."""
-        self._closing.set()
-        ended = self._busy.acquire(timeout=2.0)
-        if ended:
-            self._busy.release()
-        return ended
+        """End everything; whether an execution ended in time."""
+        super().close()
+        return not self._busy.locked()
 
     # ── the world ────────────────────────────────────────────────────────────────────────────────────
 
-    def _joints_at(self, stamp: int) -> FloatArray:
-        execution = self._execution
-        if execution is None:
-            return self._rest
-        seconds = execution.seconds(stamp)
-        return execution.tour.at(seconds).joints(seconds)
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
 
-    def _publish_joints(self) -> None:
-        stamp = self.get_clock().now().nanoseconds
-        self._joint_publisher.publish(joints_message(self._robot.joint_names, self._joints_at(stamp), stamp))
-
-    def _publish_points(self) -> None:
-        stamp = self.get_clock().now().nanoseconds
-        points = self._truth.positions(self._joints_at(stamp))[0]
-        noisy = points + self.settings.value.sigma * self._rng.standard_normal(points.shape)
-        for publisher, point in zip(self._point_publishers, noisy, strict=True):
-            publisher.publish(point_message(point, stamp, self.settings.value.frame_id))
+    def _publish(self) -> None:
+        names, frame = self.world.robot.joint_names, self.settings.value.frame_id
+        for message in self._streams.advance(self._now()):
+            if message.stream:
+                point = point_message(message.values, message.stamp, frame)
+                self._point_publishers[message.stream - 1].publish(point)
+            else:
+                self._joint_publisher.publish(joints_message(names, message.values, message.stamp))
 
     # ── execution ────────────────────────────────────────────────────────────────────────────────────
 
@@ -130,6 +142,13 @@ class SimulatorNode(Node):
             result.status, result.message = ExecutePlan.Result.INVALID_PLAN, str(error)
             self.get_logger().warning(f"plan refused: {error}")
             return result
+        except Exception as error:
+            if not self.context.ok():
+                return result  # the process is ending: nobody hears
+            goal.abort()
+            result.status, result.message = ExecutePlan.Result.ABORTED, f"{type(error).__name__}: {error}"
+            self.get_logger().error(result.message)
+            return result
         finally:
             self._busy.release()
 
@@ -138,21 +157,21 @@ class SimulatorNode(Node):
         dwell = float(goal.request.dwell)
         if not 0 <= dwell <= 600:
             raise InputError("dwell", dwell, "0 (the node's default) to 600 s")
-        check_executable(plan, self._robot)
+        check_executable(plan, self.world.robot)
+        began = self._now()
         tour = make_tour(
-            self._rest,
+            self._itinerary.at(np.array([began])).joints[0],
             plan.configurations,
             plan.repetitions,
-            self._robot.joint_limits,
+            self.world.robot.joint_limits,
             self.settings.value.joint_speed,
             dwell or self.settings.value.dwell,
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
-        began = self.get_clock().now().nanoseconds
-        self._execution = execution = Execution(tour, began)
+        execution = Execution(tour, began)
+        self._itinerary.begin(tour, began)
         stopped = self._watch(goal, execution, len(plan.configurations))
-        self._rest = self._joints_at(stopped)
-        self._execution = None
+        self._itinerary.stop(stopped)
         result.executed = tour.standstills(execution.seconds(stopped))
         if self._closing.is_set():
             return result
@@ -167,7 +186,7 @@ class SimulatorNode(Node):
     def _watch(self, goal: ServerGoalHandle, execution: Execution, total: int) -> int:
         """Send feedback until the end or a cancellation; returns the stamp [ns] of that."""
         while True:
-            stamp = self.get_clock().now().nanoseconds
+            stamp = self._now()
             seconds = execution.seconds(stamp)
             ended = seconds >= execution.tour.seconds or goal.is_cancel_requested
             if ended or self._closing.is_set():
@@ -180,10 +199,19 @@ class SimulatorNode(Node):
             self._closing.wait(FEEDBACK_PERIOD)
 
 
-def true_deviations(robot: Robot, settings: SimulatorParameters) -> dict[str, float]:
-    """The hidden errors of the active parameters [m | rad]: given, or drawn from the seed."""
-    given = settings.deviations(robot.available_parameters)
-    return given or random_deviations(robot, settings.seed, settings.length_error, settings.angle_error)
+def make_world(chosen: SimulatorParameters) -> World:
+    """Robot with its true errors, given or drawn from the seed, tracker and faults.
+
+    Raises:
+        InputError: A robot, parameter or true deviation that does not exist.
+    """
+    robot = load_shipped(chosen.robot, chosen.parameters)
+    given = chosen.deviations(robot.available_parameters)
+    errors = given or random_deviations(robot, chosen.seed, chosen.length_error, chosen.angle_error)
+    instrument = None
+    if chosen.instrument != "sigma":
+        instrument = read_instrument(config_folder() / "instruments" / f"{chosen.instrument}.yaml")
+    return World(SimulatedCell(robot, errors, chosen.sigma, instrument), chosen, chosen.seed)
 
 
 def check_executable(plan: Plan, robot: Robot) -> None:
@@ -196,6 +224,9 @@ def check_executable(plan: Plan, robot: Robot) -> None:
         raise UnknownNameError("plan.robot", plan.robot, [robot.name])
     if plan.joint_names != robot.joint_names:
         raise InputError("plan.joint_names", ", ".join(plan.joint_names), ", ".join(robot.joint_names))
+    if plan.measurements > MOST_STANDSTILLS:
+        expected = f"at most {MOST_STANDSTILLS}"
+        raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
     low, high = robot.joint_limits.T
     outside = (plan.configurations < low - 1e-6) | (plan.configurations > high + 1e-6)
     if outside.any():

@@ -19,8 +19,13 @@ NEVER = -1
 
 
 def fault(default: float, description: str, unit: str, low: float, high: float) -> Any:
-    """A field with what a person and a parser must know of it; an int default makes it a whole number."""
-    return field(default=default, metadata={"description": description, "unit": unit, "low": low, "high": high})
+    """A field with what a person and a parser must know of it; an int default makes it a whole number.
+
+    The metadata have the keys that node parameters have, so that a node inherits the faults as they are.
+    """
+    metadata = {"description": description, "unit": unit, "low": low, "high": high}
+    others = {"choices": (), "read_only": False, "at_configure": True}
+    return field(default=default, metadata=metadata | others)
 
 
 @dataclass(frozen=True)
@@ -72,21 +77,21 @@ class Faults:
     encoder_resolution: float = fault(0.0, "joint readings are multiples of this", "rad or m", 0.0, 0.1)
     unsettled_probability: float = fault(0.0, "share of arrivals not settled", "", 0.0, 1.0)
     oscillation: float = fault(1e-3, "swing of an arm not settled, at arrival", "m", 0.0, 0.1)
-    oscillation_frequency: float = fault(8.0, "its frequency", "Hz", 0.01, 1000.0)
-    oscillation_decay: float = fault(0.3, "its time constant", "s", 1e-3, 3600.0)
+    oscillation_frequency: float = fault(8.0, "frequency of that swing", "Hz", 0.01, 1000.0)
+    oscillation_decay: float = fault(0.3, "time constant of that swing", "s", 1e-3, 3600.0)
     creep: float = fault(0.0, "slow creep of an arm not settled, at arrival", "m", 0.0, 0.1)
-    creep_time: float = fault(5.0, "its time constant", "s", 1e-3, 3600.0)
+    creep_time: float = fault(5.0, "time constant of that creep", "s", 1e-3, 3600.0)
     reseat_at: int = fault(NEVER, "first arrival with the target seated elsewhere; -1 = never", "", NEVER, 10**6)
-    reseat_by: float = fault(3e-4, "how far it sits elsewhere, in the tip's frame", "m", 0.0, 0.1)
+    reseat_by: float = fault(3e-4, "how far the target then sits elsewhere, in the tip's frame", "m", 0.0, 0.1)
     drift_translation: float = fault(0.0, "speed at which the station moves", "m/s", 0.0, 0.01)
     drift_rotation: float = fault(0.0, "speed at which the station turns", "rad/s", 0.0, 0.01)
     bump_at: int = fault(NEVER, "first arrival with the station pushed; -1 = never", "", NEVER, 10**6)
-    bump_translation: float = fault(3e-4, "how far the station was pushed", "m", 0.0, 0.1)
-    bump_rotation: float = fault(1e-4, "how far it was turned", "rad", 0.0, 0.1)
+    bump_translation: float = fault(3e-4, "how far the station is then moved", "m", 0.0, 0.1)
+    bump_rotation: float = fault(1e-4, "how far the station is then turned", "rad", 0.0, 0.1)
     outlier_probability: float = fault(0.0, "share of single points far off", "", 0.0, 1.0)
     outlier_standstills: float = fault(0.0, "share of arrivals with all points far off", "", 0.0, 1.0)
-    outlier_smallest: float = fault(0.01, "how far off they are, at least", "m", 0.0, 100.0)
-    outlier_largest: float = fault(0.05, "how far off they are, at most", "m", 0.0, 100.0)
+    outlier_smallest: float = fault(0.01, "outliers: how far off, at least", "m", 0.0, 100.0)
+    outlier_largest: float = fault(0.05, "outliers: how far off, at most", "m", 0.0, 100.0)
     beam_break_interval: float = fault(0.0, "mean time between beam breaks; 0 = none", "s", 0.0, 1e6)
     beam_break_duration: float = fault(1.0, "length of a beam break", "s", 0.0, 3600.0)
     relock_error: float = fault(0.0, "error of distances after a break, std", "m", 0.0, 0.1)
@@ -96,13 +101,13 @@ class Faults:
     joint_latency: float = fault(0.0, "joint states arrive this late", "s", 0.0, 60.0)
     joint_jitter: float = fault(0.0, "mean of a further delay of joint states", "s", 0.0, 60.0)
     tracker_clock_offset: float = fault(0.0, "the tracker's clock is ahead of the robot's", "s", -3600.0, 3600.0)
-    tracker_clock_drift: float = fault(0.0, "how fast it gains on the robot's", "s/s", -0.01, 0.01)
+    tracker_clock_drift: float = fault(0.0, "how fast that clock gains on the robot's", "s/s", -0.01, 0.01)
     duplicate_probability: float = fault(0.0, "share of messages that come twice", "", 0.0, 1.0)
     reorder_probability: float = fault(0.0, "share of messages that come after later ones", "", 0.0, 1.0)
-    shuffle_delay: float = fault(0.05, "most that those come late", "s", 0.0, 60.0)
+    shuffle_delay: float = fault(0.05, "messages twice or held back: latest", "s", 0.0, 60.0)
 
     def __post_init__(self) -> None:
-        for f in fields(self):
+        for f in fields(Faults):
             low, high, unit = (f.metadata[k] for k in ("low", "high", "unit"))
             if isinstance(f.default, int):
                 check_count(f.name, getattr(self, f.name), low=low, high=high)

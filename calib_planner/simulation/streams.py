@@ -22,6 +22,8 @@ from calib_planner.simulation.world import World
 
 LONGEST_STEP = 1.0
 """Time that is made up for when nobody asked for longer; beyond that the streams begin anew [s]."""
+ANOTHER_DAY = 3600.0
+"""A jump of the clock beyond which the simulation starts again [s]; so does one back."""
 PHASE = 0.37
 """Trackers do not sample when joints do: part of their period by which they are late."""
 
@@ -81,9 +83,11 @@ class Streams:
     def advance(self, until: int) -> list[Message]:
         """What arrives after the time asked for last, up to ``until`` [ns], in the order of arrival.
 
-        After a jump of the clock beyond ``LONGEST_STEP``, back or forth, the streams begin anew at ``until``.
+        After a pause beyond ``LONGEST_STEP``, or a jump of the clock, the streams begin anew at ``until``.
         """
-        if abs(until - self._now) > LONGEST_STEP * NANO:
+        jump = (until - self._now) / NANO
+        if jump > LONGEST_STEP or jump < 0:
+            self._start = self._start if 0 < jump < ANOTHER_DAY else until
             self._begin(until)
         self._now = until
         for k in range(len(self._samplers)):

@@ -114,9 +114,9 @@ def test_good_values_are_followed(bench: Bench) -> None:
         (PlannerNode, {"sigma": "a"}),
         (IdentifierNode, {"minimum_samples": 30}),
         (IdentifierNode, {"tracker_topics": ["a", "b"]}),
-        (SimulatorNode, {"true_deviations": "none=1"}),
-        (SimulatorNode, {"true_deviations": "d1=nan"}),
-        (SimulatorNode, {"true_deviations": "d1"}),
+        (SimulatorNode, {"dropout_probability": 1.5}),
+        (SimulatorNode, {"outlier_smallest": 0.2}),
+        (SimulatorNode, {"instrument": "../laser_tracker"}),
     ],
 )
 def test_a_bad_start_is_refused(bench: Bench, node: Any, values: dict[str, Any]) -> None:
