@@ -18,7 +18,9 @@ from calib_planner.files.plan_yaml import write_plan
 from calib_planner.files.text import write_text
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.solver import identify
+from calib_planner.report.calibration_report import write_report
 from calib_planner.report.demo_report import RANDOM_PLANS, DemoResult, demo_report, draw
+from calib_planner.report.provenance import provenance
 from calib_planner.robot.chain import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -74,7 +76,8 @@ def run_demo(
     truth = random_deviations(robot, truth_seed)
     cell = SimulatedCell(robot, truth, settings.sigma)
     data = cell.measure(found.configurations, found.repetitions, noise_seed)
-    estimate = identify(IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE]))
+    asked = IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE])
+    estimate = identify(asked)
     result = demo_report(
         problem,
         found,
@@ -87,6 +90,12 @@ def run_demo(
     write_plan(folder / "plan.yaml", found)
     write_measurements(folder / "measurements.csv", data)
     write_estimate(folder / "estimate.yaml", estimate)
+    made = provenance(
+        [("robot", ROBOT), ("data", folder / "measurements.csv")],
+        seed=settings.seed,
+        estimate=str(folder / "estimate.yaml"),
+    )
+    write_report(folder / "calibration.html", asked, estimate, made)
     write_text(folder / "demo.json", json.dumps(result.to_dict(), indent=2, ensure_ascii=False) + "\n")
     draw(result, folder / "demo.png")
     return result

@@ -63,4 +63,4 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
 
         result = run_demo(settings, args.output, report)
     terminal.answer(result.to_dict(), lambda console: print_table(result, console))
-    terminal.note(f"Plan, measurements, estimate and picture are in {args.output}")
+    terminal.note(f"Plan, measurements, estimate, picture and report (calibration.html) are in {args.output}")

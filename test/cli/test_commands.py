@@ -133,7 +133,7 @@ def test_demo(call: Any, tmp_path: Path) -> None:
     assert result["before"] > 10 * result["after"] and result["after"] < 4 * result["predicted_accuracy"]
     for row in result["parameters"]:
         assert abs(row["value"] - row["true"]) < 4 * row["std"]
-    names = ["demo.json", "demo.png", "estimate.yaml", "measurements.csv", "plan.yaml"]
+    names = ["calibration.html", "demo.json", "demo.png", "estimate.yaml", "measurements.csv", "plan.yaml"]
     assert sorted(p.name for p in folder.iterdir()) == names
     assert json.loads((folder / "demo.json").read_text()) == result
 
