@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup demo test docs lint bench clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -14,6 +14,11 @@ demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 
 test: setup ## run every test (more options: make test PYTEST='-k plan')
 	@. ./env.sh && python -m pytest $(PYTEST)
+
+docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
+	@. ./env.sh && python tools/reference && \
+	  python -m sphinx -q -W --keep-going -b html -d build/docs/.doctrees docs build/docs && \
+	  echo "make docs: build/docs/index.html"
 
 lint: setup ## ruff and mypy
 	@. ./env.sh && ruff check . && ruff format --check . && mypy

@@ -37,6 +37,7 @@ setup(
     install_requires=["numpy>=1.23", "scipy>=1.8", "PyYAML", "matplotlib>=3.5", "rich>=12", "Jinja2>=3"],
     extras_require={
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
+        "docs": ["sphinx>=8.1", "myst-parser>=4", "furo"],
         "bags": ["rosbags"],
         "collision": ["pin"],
         "distributed": ["dask[distributed]"],

@@ -97,7 +97,7 @@ if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
     "$VENV/bin/python" tools/missing_pins.py requirements/constraints.txt >"$VENV/constraints.txt"
     # What is needed at run time comes from the system, as package.xml says; what it lacks, from here.
     grep -vE '^#' requirements/core.txt | sed 's/==.*//' >"$VENV/core.txt"
-    grep -vE '^#' requirements/test.txt requirements/build.txt -h | sed 's/==.*//' >>"$VENV/core.txt"
+    grep -vE '^#' requirements/test.txt requirements/docs.txt requirements/build.txt -h | sed 's/==.*//' >>"$VENV/core.txt"
     run "installing packages" "$VENV/bin/python" -m pip install --disable-pip-version-check \
       -c "$VENV/constraints.txt" -r "$VENV/core.txt"
   else
@@ -107,7 +107,8 @@ if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
     fi
     run "installing packages" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" -m pip install \
       --disable-pip-version-check -c requirements/constraints.txt \
-      -r requirements/build.txt -r requirements/core.txt -r requirements/test.txt -r requirements/ros.txt
+      -r requirements/build.txt -r requirements/core.txt -r requirements/test.txt -r requirements/docs.txt \
+      -r requirements/ros.txt
     [ -z "$fresh" ] || run "patching the ROS wheels" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" tools/patch_ros_wheels.py
   fi
   touch "$VENV/COLCON_IGNORE"
