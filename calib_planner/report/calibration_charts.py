@@ -16,6 +16,7 @@ import numpy as np
 
 from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.identification.estimate import Estimate, Validation
+from calib_planner.identification.structure import FEWEST
 from calib_planner.report.calibration_report import CalibrationReport
 from calib_planner.report.quantities import length
 from calib_planner.report.scene import REJECTED, SUSPECT, USED, point_states, thinned
@@ -164,10 +165,12 @@ def joint_charts(report: CalibrationReport) -> list[str]:
 
 
 def _joint_marks(chart: Chart, q: FloatArray, parts: FloatArray, keep: IntArray, use: np.ndarray) -> list[str]:
-    """Dots of the points ``keep`` (row, target), and means over bins of all points in ``use``."""
+    """Dots of the points ``keep`` (row, target), and means over bins of all in ``use``, if q varies."""
     drawn = []
     for c in (2, 1, 0):
         drawn.append(chart.dots(f"{PARTS[c]} small", q[keep[:, 0]], parts[keep[:, 0], keep[:, 1], c]))
+    if len(np.unique(q[keep[:, 0]])) < FEWEST:
+        return drawn
     rows = np.broadcast_to(q[:, None], use.shape)[use]
     for c in (2, 1, 0):
         drawn.append(chart.line(f"mean {PARTS[c]}", *_means(rows, parts[..., c][use])))

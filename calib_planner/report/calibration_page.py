@@ -68,6 +68,7 @@ def report_page(report: CalibrationReport) -> str:
         headline=HEADLINES[data["estimate"]["verdict"]["level"]],
         sets=_sets(report.estimate),
         parameters=_parameters(report.estimate),
+        placed=any(name.startswith(PLACEMENT) for name in report.estimate.parameters),
         structure=_structure(report.estimate),
         ways=ways_to_apply(report),
         pictures=_pictures(report),

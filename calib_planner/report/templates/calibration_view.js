@@ -55,7 +55,7 @@ const calibrationView = (function () {
   function camera(width, height) {
     const [sy, cy, sp, cp] = [Math.sin(state.yaw), Math.cos(state.yaw), Math.sin(state.pitch), Math.cos(state.pitch)];
     const far = 3.2 * bounds.radius, size = state.zoom * Math.min(width / spread.x, height / spread.y);
-    return projection(sy, cy, sp, cp, far, size, width, height);
+    return projection(sy, cy, sp, cp, far, size, width, height - 2 * spread.middle * size);
   }
 
   function projection(sy, cy, sp, cp, far, size, width, height) {
@@ -68,17 +68,18 @@ const calibrationView = (function () {
     };
   }
 
-  function homeSpread() { // twice the farthest that anything reaches from the middle while the view turns once round
-    const found = { x: 1e-9, y: 1e-9 }, [sp, cp] = [Math.sin(HOME.pitch), Math.cos(HOME.pitch)];
+  function homeSpread() { // how far everything reaches on the screen, at scale 1, while the view turns once round
+    const [sp, cp] = [Math.sin(HOME.pitch), Math.cos(HOME.pitch)];
+    let [wide, low, high] = [1e-9, -1e-9, 1e-9];
     for (let k = 0; k < 12; k++) {
       const yaw = HOME.yaw + k * Math.PI / 6;
       const see = projection(Math.sin(yaw), Math.cos(yaw), sp, cp, 3.2 * bounds.radius, 1, 0, 0);
       for (const at of solid.map(see)) {
-        found.x = Math.max(found.x, 2.15 * Math.abs(at.x));
-        found.y = Math.max(found.y, 2.45 * Math.abs(at.y));
+        wide = Math.max(wide, 2 * Math.abs(at.x));
+        [low, high] = [Math.min(low, at.y), Math.max(high, at.y)];
       }
     }
-    return found;
+    return { x: 1.1 * wide, y: 1.2 * (high - low), middle: (low + high) / 2 };
   }
   const spread = homeSpread();
 
