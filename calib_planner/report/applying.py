@@ -31,19 +31,30 @@ def ways_to_apply(report: CalibrationReport) -> list[Way]:
     robot = made.named("robot") or report.problem.robot.source or report.problem.robot.name
     estimate = made.estimate or "estimate.yaml"
     again = _again(report, robot)
+    learnt = report.estimate.transmission is not None
+    without = " The joint corrections are not in it." if learnt else ""
     ways = []
     if PurePath(robot).suffix.lower() in URDF_SUFFIXES:
         text = (
             "Your URDF with the identified origins of the joints, all else byte for byte: your robot_description."
         )
         ways.append(
-            Way("A controller or planner that reads a URDF", text, f"{again} --urdf-output calibrated.urdf")
+            Way(
+                "A controller or planner that reads a URDF",
+                text + without,
+                f"{again} --urdf-output calibrated.urdf",
+            )
         )
     text = "x, y, z, roll, pitch, yaw per joint and a hash, in the form of Universal Robots' description."
     ways.append(
-        Way("Kinematics from xyz + rpy per joint", text, f"{again} --kinematics-output my_kinematics.yaml")
+        Way(
+            "Kinematics from xyz + rpy per joint",
+            text + without,
+            f"{again} --kinematics-output my_kinematics.yaml",
+        )
     )
     text = "Joint targets corrected one by one, so that the real tool goes where the nominal model says."
+    text += " With the joint corrections: this alone reaches the accuracy above." if learnt else ""
     command = (
         f"calib-planner compensate --robot {quote(robot)} --estimate {quote(estimate)} "
         "--targets path.csv --output corrected.csv"

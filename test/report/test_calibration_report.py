@@ -298,6 +298,7 @@ def test_a_measured_robot() -> None:
     apply = page.text["apply"]
     assert "--urdf-output calibrated.urdf" in apply and str(folder / "irb120.urdf") in apply
     assert "compensate --robot" in apply and len(page.json["scene"]["points"]) == 108
+    assert ("The joint corrections are not in it" in apply) == (estimate.transmission is not None)
 
 
 # ── provenance ───────────────────────────────────────────────────────────────────────────────────────
