@@ -30,7 +30,7 @@ DESCRIPTION = """Correct joint targets so that the real tool goes where the nomi
 The CSV of targets has a column per joint [rad | m], in any order. What is written has the same rows: the
 corrected joints [rad | m], what remains (position_error [m], rotation_error [rad]), and reached: 1, or 0 where
 the row could not be reached exactly and is the closest there is. Joint limits are respected. Where the base
-stands before the tracker plays no part."""
+stands before the tracker plays no part. Joint corrections that the estimate holds are applied."""
 
 ERRORS = ("position_error", "rotation_error", "reached")
 
@@ -54,7 +54,12 @@ def add(commands: Commands) -> None:
         "--tool",
         type=numbers,
         metavar='"x y z"',
-        help="that point, in the frame of the last link [m] (target 1: as nominal, and as identified)",
+        help="that point, in the frame of the last link [m] (the first reflector, as identified)",
+    )
+    what.add_argument(
+        "--geometry-only",
+        action="store_true",
+        help="leave out the joint corrections that the estimate may hold: what a calibrated URDF does",
     )
     what.add_argument("--ignore-limits", action="store_true", help="joint limits do not matter")
     add_seed(parser)
@@ -64,13 +69,23 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work."""
     nominal = load_robot(args)
-    calibrated = calibrated_robot(nominal, read_estimate(args.estimate))
+    saved = read_estimate(args.estimate)
+    learnt = None if args.geometry_only else saved.joint_corrections
+    calibrated = calibrated_robot(nominal, saved) if learnt is None else saved.complete(nominal)
+    if args.position_only and args.tool is None and saved.targets is not None:
+        # The same point of the tool on both robots: a nominal place of a reflector is no more than a guess.
+        nominal, calibrated = nominal.with_targets(saved.targets), calibrated.with_targets(saved.targets)
     if args.tool is not None:
         nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
     q = read_configurations(args.joint_targets, nominal, degrees=args.degrees)
     with terminal.working("correcting"):
         found = compensate(
-            nominal, calibrated, q, position_only=args.position_only, limits=not args.ignore_limits
+            nominal,
+            calibrated,
+            q,
+            position_only=args.position_only,
+            limits=not args.ignore_limits,
+            corrections=None if learnt is None else learnt.corrections,
         )
     if args.output:
         write_text(args.output, _csv(found), "--output")
@@ -80,6 +95,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         "robot": nominal.name,
         **found.to_dict(),
         "position_only": args.position_only,
+        "joint_corrections": learnt is not None,
         "output": args.output,
     }
     if args.json:

@@ -25,6 +25,8 @@ FEWEST_SPARE = 10
 """Redundant equations below which little can be said about noise and gross errors."""
 REJECTED = (0.05, 0.20)
 """Shares of rejected points that deserve a warning, and distrust."""
+MANY, INSIDE = 30, 0.8
+"""Of as many held-out points at least this share must lie in their 95 % region."""
 APART = (1.5, 3.0)
 """Achieved over predicted error that deserves a warning, and distrust."""
 
@@ -221,6 +223,12 @@ def _validation(v: Validation, what: str, required: float) -> Iterator[Reason]:
         text = f"{what}: {mm(v.rms)} achieved where {mm(v.predicted_rms)} were predicted"
         advice = "" if level == "PASS" else "they lie elsewhere than what was measured, or the robot changed"
         yield Reason(level, "predicted_and_achieved", text, advice)
+    if v.count >= MANY and v.within_95 < INSIDE:
+        text = f"{what}: only {100 * v.within_95:.0f} % lie in the regions where 95 % were expected"
+        advice = (
+            "something changed between the two sets: temperature, the tracker's place, the target's seat, load"
+        )
+        yield Reason("WARN", "region", text, advice)
     if np.isfinite(required):
         level = "PASS" if v.rms <= required else "FAIL"
         yield Reason(level, "required_accuracy", f"{what}: {mm(v.rms)} where {mm(required)} are required")
