@@ -9,7 +9,7 @@ test pose whose accuracy rests on what the data cannot see. Writing what was rea
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -139,17 +139,21 @@ def _finite(path: str | Path, key: str, value: Any, shape: tuple[int | None, ...
 
 
 def _made(path: str | Path, key: str, value: Any, kind: type[T], more: tuple[str, ...] = ()) -> T | None:
-    """A dataclass from the mapping of its fields; keys in ``more`` are derived from them."""
+    """A dataclass from the mapping of its fields; keys in ``more`` are derived from them.
+
+    Fields with a default may be missing: an older version did not know them.
+    """
     if value is None:
         return None
     kinds = {f.name: str(f.type) for f in fields(kind)}  # type: ignore[arg-type]
-    found = check_keys(path, key, value, tuple(kinds), more)
+    needed = [f.name for f in fields(kind) if f.default is MISSING]  # type: ignore[arg-type]
+    found = check_keys(path, key, value, needed, (*kinds, *more))
 
     def item(name: str) -> Any:
         given = _nan(found[name]) if kinds[name] == "float" else found[name]
         return read_value(path, f"{key}.{name}", kinds[name], given)
 
-    return kind(**{name: item(name) for name in kinds})
+    return kind(**{name: item(name) for name in kinds if name in found})
 
 
 def _corrections(path: str | Path, document: dict[str, Any]) -> SavedCorrections | None:

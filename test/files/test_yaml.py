@@ -294,6 +294,16 @@ def test_any_numbers_come_back(small: Estimate, data: st.DataObject) -> None:
     assert {n: read.document[n] for n in texts} == texts
 
 
+def test_older_files_lack_what_has_a_default(tmp_path: Path, placed: Estimate) -> None:
+    path = tmp_path / "estimate.yaml"
+    write_estimate(path, placed)
+    noise = {k: v for k, v in yaml.safe_load(path.read_text())["noise"].items() if k not in ("point", "scaled")}
+    read = read_estimate(change(path, noise=noise, base=None, targets=None, verdict=None, chi_square=None))
+    assert read.noise is not None and read.noise.measurement == placed.noise.measurement
+    assert (read.noise.point, read.noise.scaled) == (0.0, 1.0)
+    assert (read.base, read.targets, read.verdict, read.chi_square) == (None, None, None, None)
+
+
 BAD_ESTIMATES: dict[str, tuple[dict[str, Any], str]] = {
     "covariance": ({"covariance": [[1.0]]}, "covariance: expected numbers"),
     "ragged": ({"covariance": [[1.0], [1.0, 2.0]]}, "covariance: expected a list of numbers"),
