@@ -41,6 +41,7 @@ SIGMA = 3e-5
 SPEED, DWELL = 6.0, 0.8
 PLAN_TOLERANCE = 0.01
 WITHIN = 4.0
+VERDICTS = ("PASS", "WARN", "FAIL", "refused", "crash")
 POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 UNKNOWN = (float("nan"), float("nan"))
 SPAN = {"known": 45.0, "placed": 60.0}
@@ -234,7 +235,9 @@ def row(runs: Sequence[Run]) -> dict[str, Any]:
 def show(name: str, line: dict[str, Any]) -> None:
     """The same for people."""
     levels = line["levels"]
-    text = f"{name:<24}" + "".join(f" {levels.get(k, 0):>7}" for k in ("PASS", "WARN", "FAIL", "refused"))
+    text = f"{name:<24}" + "".join(
+        f" {levels.get(k, 0):>7}" for k in ("PASS", "WARN", "FAIL", "refused", "crash")
+    )
     text += f" {line['worst_of_pass']:9.1f} {line['worst']:8.1f} {line['worst_at_pose_of_pass']:8.1f}"
     text += f" {len(line['wrong']):6} {line['accepted']:9.1f}  "
     text += ", ".join(f"{k} {v:.1f}" for k, v in line["rejected"].items()) or "–"
@@ -255,7 +258,9 @@ def main() -> int:
     for setup in args.setup:
         began = time.perf_counter()
         print(f"\n{setup}: verdicts of {args.seeds} campaigns, worst |error|/std", file=sys.stderr)
-        head = f"{'fault':<24}    PASS    WARN    FAIL refused   of PASS   of all  at pose  wrong  accepted"
+        head = (
+            f"{'fault':<24}    PASS    WARN    FAIL refused   crash   of PASS   of all  at pose  wrong  accepted"
+        )
         print(f"{head}  rejected per campaign", file=sys.stderr)
         result[setup] = {}
         for fault in args.faults:

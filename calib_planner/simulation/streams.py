@@ -100,6 +100,10 @@ class Streams:
             arrived.append(heapq.heappop(self._waiting)[3])
         return arrived
 
+    def drain(self) -> list[Message]:
+        """What is still under way, in the order of arrival; nothing is sampled."""
+        return [heapq.heappop(self._waiting)[3] for _ in range(len(self._waiting))]
+
     def _begin(self, now: int) -> None:
         self._now = now
         self._waiting.clear()
@@ -119,15 +123,15 @@ class Streams:
 def play(
     world: World, tour: Tour, rates: Rates | None = None, start: int = 0, rest: float = 0.5
 ) -> Iterator[Message]:
-    """A whole tour from ``start`` [ns], as fast as it can be computed; it ends ``rest`` [s] after the tour."""
+    """A whole tour from ``start`` [ns], as fast as it can be computed; sampling ends ``rest`` [s] after it."""
     itinerary = Itinerary(tour.phases[0].start)
     itinerary.begin(tour, start)
     streams = Streams(world, itinerary.at, rates, start)
-    f = world.faults
-    late = max(f.tracker_latency + 20 * f.tracker_jitter, f.joint_latency + 20 * f.joint_jitter) + f.shuffle_delay
-    step, end = NANO // 2, start + round((tour.seconds + rest + late) * NANO)
-    for now in range(start + step, end + step, step):
+    end = start + round((tour.seconds + rest) * NANO)
+    for now in range(start + NANO // 2, end, NANO // 2):
         yield from streams.advance(now)
+    yield from streams.advance(end)
+    yield from streams.drain()
 
 
 class _Sampler:
