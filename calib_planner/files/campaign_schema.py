@@ -20,7 +20,8 @@ MIGRATIONS = (
     """
     CREATE TABLE model (
         one INTEGER PRIMARY KEY CHECK (one = 1), name TEXT NOT NULL, joint_names TEXT NOT NULL,
-        targets INTEGER NOT NULL, sha256 TEXT NOT NULL, source TEXT NOT NULL, at TEXT NOT NULL);
+        targets INTEGER NOT NULL, origin TEXT NOT NULL, sha256 TEXT NOT NULL, source TEXT NOT NULL,
+        at TEXT NOT NULL);
     CREATE TABLE settings (
         number INTEGER PRIMARY KEY, version TEXT NOT NULL, document TEXT NOT NULL, at TEXT NOT NULL);
     CREATE TABLE campaigns (

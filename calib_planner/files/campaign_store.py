@@ -54,12 +54,14 @@ class StoredModel:
         joint_names: Order of joint arrays.
         targets: Number of targets.
         source: The text it was read from, a robot YAML or URDF.
+        origin: Where that came from: the name of a shipped robot, or of a topic.
     """
 
     name: str
     joint_names: tuple[str, ...]
     targets: int
     source: str
+    origin: str = ""
 
     @property
     def sha256(self) -> str:
@@ -106,6 +108,29 @@ class CampaignStore:
         row = self._one("SELECT c.* FROM campaigns AS c JOIN current ON current.campaign = c.number")
         return None if row is None else self._campaign(row)
 
+    def find(self, plan_id: str, plan: Plan | None) -> StoredCampaign | None:
+        """The newest campaign of a plan; ``None`` if there is none.
+
+        Raises:
+            InputError: There is another plan of this name, or the name is too long.
+            StoreError: The file cannot be read now.
+        """
+        if len(plan_id) > LONGEST:
+            raise InputError("plan_id", f"{len(plan_id)} characters", f"at most {LONGEST} characters")
+        row = self._one("SELECT * FROM campaigns WHERE plan_id = ? ORDER BY number DESC LIMIT 1", plan_id)
+        if row is None:
+            return None
+        known = self._campaign(row)
+        if not same_plan(known.plan, plan):
+            advice = "give the new plan a name of its own, or choose another folder"
+            raise InputError("plan_id", repr(plan_id), "a name that no other plan in the store has", advice)
+        return known
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was ever recorded."""
+        return self._one("SELECT 1 FROM standstills LIMIT 1") is None
+
     def history(self, standstill: int) -> list[dict[str, Any]]:
         """All that was ever decided about a standstill, oldest first: campaign, status, reason, at."""
         sql = "SELECT campaign, status, reason, at FROM decisions WHERE standstill = ? ORDER BY number"
@@ -123,18 +148,12 @@ class CampaignStore:
             InputError: There is another plan of this name.
             StoreError: It cannot be written.
         """
-        if len(plan_id) > LONGEST:
-            raise InputError("plan_id", f"{len(plan_id)} characters", f"at most {LONGEST} characters")
-        row = self._one("SELECT * FROM campaigns WHERE plan_id = ? ORDER BY number DESC LIMIT 1", plan_id)
-        if row is not None:
-            known = self._campaign(row)
-            if not same_plan(known.plan, plan):
-                advice = "give the new plan a name of its own, or choose another folder"
-                raise InputError("plan_id", repr(plan_id), "a name that no other plan in the store has", advice)
-            with self._writing() as write:
-                self._point_at(write, known.number)
-            return known
-        return self._new(plan_id, plan, carried)
+        known = self.find(plan_id, plan)
+        if known is None:
+            return self._new(plan_id, plan, carried)
+        with self._writing() as write:
+            self._point_at(write, known.number)
+        return known
 
     def restart(self, plan_id: str, plan: Plan | None) -> StoredCampaign:
         """A campaign of the same plan with nothing measured; the former stays in the file.
@@ -226,6 +245,23 @@ class CampaignStore:
                 return
 
 
+class UnavailableStore(CampaignStore):
+    """Stands in for a store that cannot be opened at the moment: empty, and nothing can be written."""
+
+    def __init__(self, model: StoredModel, error: StoreError) -> None:
+        super().__init__(None, sqlite3.connect(":memory:", check_same_thread=False), model)
+        self.error = error
+
+    def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
+        return []
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        # A new one each time: an exception keeps the trace of every raise.
+        raise StoreError(self.error.path, self.error.reason)
+        yield
+
+
 # ── opening ──────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -236,7 +272,7 @@ def open_store(
 
     Args:
         folder: Is made if it is not there; empty: in memory, gone with the process.
-        model: The robot it has to belong to.
+        model: The robot it has to belong to; one in which nothing was measured yet takes any.
         settings: What else decides what an estimate is; kept for the record.
         version: Of this package, for the record.
         field: The parameter that named the folder, for errors.
@@ -259,20 +295,48 @@ def open_store(
     return store
 
 
+def stored_model(folder: str, field: str = "store_folder") -> StoredModel | None:
+    """Which robot the store in a folder belongs to; ``None`` without one, or if nothing was measured yet.
+
+    Raises:
+        As ``open_store``.
+    """
+    path = Path(folder).expanduser() / FILE
+    if not folder or not path.exists():
+        return None
+    database = connect(path, field)
+    try:
+        prepare(database, path, field)
+        store = CampaignStore(path, database, StoredModel("", (), 0, ""))
+        row = store._one("SELECT * FROM model")
+        return None if row is None or store.empty else _model_of(row)
+    finally:
+        database.close()
+
+
+def _model_of(row: Mapping[str, Any]) -> StoredModel:
+    joints = tuple(json.loads(row["joint_names"]))
+    return StoredModel(row["name"], joints, row["targets"], row["source"], row["origin"])
+
+
 def _check_model(store: CampaignStore) -> None:
     model, row = store.model, store._one("SELECT * FROM model")
-    if row is None:
+    found = None if row is None else _model_of(row)
+    if found is None or (found != model and store.empty):
         with store._writing() as write:
+            write.execute("DELETE FROM current")
+            write.execute("DELETE FROM campaigns")
+            write.execute("DELETE FROM model")
             columns = {"one": 1, "name": model.name, "joint_names": json.dumps(model.joint_names)}
-            columns |= {"targets": model.targets, "sha256": model.sha256, "source": model.source, "at": _now()}
-            _insert(write, "model", columns)
+            columns |= {"targets": model.targets, "origin": model.origin, "sha256": model.sha256}
+            _insert(write, "model", columns | {"source": model.source, "at": _now()})
         return
     advice = "choose another folder, or start with the robot that the store belongs to"
     for field, got, expected in (
-        ("robot", row["name"], model.name),
-        ("joint_names", row["joint_names"], json.dumps(model.joint_names)),
-        ("targets", row["targets"], model.targets),
-        ("model of the robot, sha256", row["sha256"], model.sha256),
+        ("robot", found.name, model.name),
+        ("joint_names", found.joint_names, model.joint_names),
+        ("targets", found.targets, model.targets),
+        ("model of the robot, sha256", found.sha256, model.sha256),
     ):
         if got != expected:
             raise FileFormatError(store.path, field, got, str(expected), advice)

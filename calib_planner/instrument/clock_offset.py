@@ -9,7 +9,7 @@ as quick at its end as at its beginning, so the middles differ by τ and the len
 
 The offset of a target is the median of its last standstills. A beam that was broken shortens the target's
 interval and shows as doubt, a target that did not move at all has none. An offset shorter than the time left out
-after coming to rest does no harm to means over standstills; one that is longer pairs points with the wrong joints.
+after coming to rest does no harm to means over standstills; a longer one pairs points with the wrong joints.
 """
 
 from __future__ import annotations

@@ -19,7 +19,13 @@ from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.errors import FileFormatError, InputError, StoreError
 from calib_planner.files.campaign_records import LONGEST, Decision
 from calib_planner.files.campaign_schema import FILE, MIGRATIONS
-from calib_planner.files.campaign_store import CampaignStore, StoredModel, open_store
+from calib_planner.files.campaign_store import (
+    CampaignStore,
+    StoredModel,
+    UnavailableStore,
+    open_store,
+    stored_model,
+)
 from calib_planner.instrument.standstill import Reason, Rejection, Standstill
 
 MOVED = Rejection(3, 4, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0]))
@@ -219,6 +225,34 @@ def test_a_store_of_another_robot_is_refused(tmp_path: Path, other: StoredModel,
         opened(tmp_path, other)
     assert "another folder" in str(caught.value) and content(tmp_path) == before
     opened(tmp_path).close()
+
+
+def test_a_store_in_which_nothing_was_measured_takes_another_robot(tmp_path: Path, planned: Plan) -> None:
+    store = opened(tmp_path)
+    store.begin("a", planned)
+    store.close()
+    other = replace(MODEL, name="leg", joint_names=("h",), targets=1, origin="robot_description")
+    store = opened(tmp_path, other)
+    assert store.current() is None and store.empty and stored_model(str(tmp_path / "none")) is None
+    found = Standstill(0, 1, np.ones(1), np.ones((1, 3)), np.ones(1), np.array([1]))
+    store.record(begun(store), decision(found))
+    store.close()
+    assert stored_model(str(tmp_path)) == other
+    with pytest.raises(FileFormatError, match="robot"):
+        opened(tmp_path)
+
+
+def test_a_store_that_cannot_be_opened_takes_nothing(planned: Plan) -> None:
+    store = UnavailableStore(MODEL, StoreError("/mnt/x", "no space left"))
+    assert store.current() is None and store.empty and store.find("a", planned) is None
+    for attempt in (
+        lambda: store.begin("a", planned),
+        lambda: store.restart("a", planned),
+        lambda: store.record(1, decision(standstill(1))),
+        lambda: store.decide(1, [decision(standstill(1))]),
+    ):
+        with pytest.raises(StoreError, match="no space left"):
+            attempt()
 
 
 def test_the_model_and_the_settings_are_kept(tmp_path: Path) -> None:
