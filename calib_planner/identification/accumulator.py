@@ -15,14 +15,15 @@ could tip a decision, and where other parameters are held than before.
 An information matrix that is updated by a row would be faster and another answer: every new point moves the
 linearisation, the closed-form start of an unknown tracker pose, the noise and the points that are believed.
 
-Other starts, a check that the minimum is the only one, are left to the end (``starts`` is 0 unless it is set):
+What takes longer than that and changes none of the parameters is left to the end, unless it is asked for: other
+starts, which show that the minimum is the only one, and errors of the joints' transmissions.
 
     accumulator = Accumulator.begin(robot, sigma=3e-5)
     for q, points in measured:
         accumulator = accumulator.with_configuration(q, points)
         show(accumulator.estimate)                     # None while there are too few
     accumulator = accumulator.without(accumulator.ids[3])
-    final = identify(replace(accumulator.problem, starts=2), start=accumulator.estimate)
+    final = identify(replace(accumulator.problem, starts=2, joint_corrections="auto"), accumulator.estimate)
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.solver import identify
 from calib_planner.robot.chain import Robot
+
+UPDATE: Mapping[str, Any] = MappingProxyType({"starts": 0, "joint_corrections": "off"})
+"""Settings that are other than a problem's own where they are not given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +75,8 @@ class Accumulator:
 
         Args:
             robot: The nominal robot with its active parameters.
-            settings: Fields of ``IdentificationProblem`` other than ``robot`` and ``data``; ``starts`` is 0
-                unless it is given.
+            settings: Fields of ``IdentificationProblem`` other than ``robot`` and ``data``; those not given are
+                its defaults, but for ``UPDATE``.
 
         Raises:
             UnknownNameError: No such setting.
@@ -82,7 +86,7 @@ class Accumulator:
         for name in settings:
             if name not in names:
                 raise UnknownNameError("settings", name, names)
-        settings = {"starts": 0} | settings
+        settings = {**UPDATE, **settings}
         middle = robot.joint_limits.mean(axis=1)[None]
         # A made-up measurement, to refuse wrong settings before the first real one.
         IdentificationProblem(robot, Measurements(robot.joint_names, middle, robot.positions(middle)), **settings)

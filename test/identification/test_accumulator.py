@@ -12,7 +12,7 @@ import pytest
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.identification import accumulator as room
-from calib_planner.identification.accumulator import Accumulator
+from calib_planner.identification.accumulator import UPDATE, Accumulator
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.prior import typical_prior
 from calib_planner.robot.elements import rotation
@@ -104,7 +104,7 @@ def repetitions() -> tuple[Robot, Measurements, dict[str, Any]]:
 def elastic() -> tuple[Robot, Measurements, dict[str, Any]]:
     """More than the stated noise is left: a discrepancy is estimated."""
     robot, data = cell(30, 8, level="lengths+offsets")
-    return robot, data, {"sigma": SIGMA / 5, "joint_corrections": "off"}
+    return robot, data, {"sigma": SIGMA / 5}
 
 
 CASES: dict[str, Callable[[], tuple[Robot, Measurements, dict[str, Any]]]] = {
@@ -169,7 +169,7 @@ def streamed(robot: Robot, data: Measurements, settings: dict[str, Any]) -> list
 @pytest.mark.parametrize("name", CASES)
 def test_the_same_as_all_at_once(name: str) -> None:
     robot, data, settings = CASES[name]()
-    settings = {"starts": 0} | settings
+    settings = {**UPDATE, **settings}
     states = streamed(robot, data, settings)
     for count in (*range(1, 9), *range(9, len(data), 3), len(data)):
         problem = IdentificationProblem(robot, data.select(np.arange(count)), **settings)
@@ -278,7 +278,7 @@ def test_a_file_at_once_and_then_one_by_one() -> None:
     start = Accumulator.begin(robot, sigma=SIGMA).with_measurements(turned.select(np.arange(15)))
     done = start.with_configuration(data.q[15], data.p[15])
     assert done.ids == tuple(range(16))
-    assert_same(done.estimate, identify(IdentificationProblem(robot, data, SIGMA, starts=0)))
+    assert_same(done.estimate, identify(IdentificationProblem(robot, data, SIGMA, **UPDATE)))
 
 
 def test_bad_input_is_refused() -> None:
@@ -334,3 +334,13 @@ def test_predicts_where_the_robot_really_is() -> None:
     assert estimate is not None
     error = np.linalg.norm(estimate.calibrated.positions(q) - truth, axis=2)
     assert np.sqrt(np.mean(error**2)) < 2 * estimate.predicted_accuracy < 1e-3
+
+
+def test_what_is_left_to_the_end_changes_no_parameter() -> None:
+    robot, data, settings = elastic()
+    accumulator = Accumulator.begin(robot, **settings).with_measurements(data)
+    update = accumulator.estimate
+    final = identify(replace(accumulator.problem, starts=2, joint_corrections="auto"), update)
+    assert update is not None and (update.starts, final.starts, final.agreeing_starts) == (0, 2, 2)
+    np.testing.assert_allclose(update.values, final.values, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(update.std, final.std, rtol=0, atol=TOLERANCE)
