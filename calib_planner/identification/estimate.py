@@ -115,6 +115,7 @@ class Estimate:
         rejected: ``{row, target, reason, normalised_residual, residual}`` of every point not used; rows from 0,
             targets from 1 as in the column names.
         suspects: The same of points used although they lie beyond the gate.
+        copies: Rows that repeat another one digit for digit.
         resolved_by_prior: Combinations that the data cannot see and the prior decides.
         nearly_dependent: Combinations that the data hardly see, weakest first.
         prior: Where the prior came from; empty without one.
@@ -161,6 +162,7 @@ class Estimate:
     used: int
     rejected: tuple[dict[str, Any], ...]
     suspects: tuple[dict[str, Any], ...]
+    copies: int
     sigma: float
     sigma_estimate: float
     noise: NoiseLevels
@@ -265,6 +267,7 @@ class Estimate:
             "used": self.used,
             "rejected": list(self.rejected),
             "suspects": list(self.suspects),
+            "copies": self.copies,
             "gate": self.gate,
             "sigma": self.sigma,
             "sigma_estimate": self.sigma_estimate,
@@ -282,6 +285,7 @@ class Estimate:
             "status": self.status,
             "message": self.message,
             "verdict": asdict(self.verdict),
+            "required_accuracy": self.required_accuracy,
             "seconds": self.seconds,
         }
         if len(self.test_poses):

@@ -22,7 +22,7 @@ from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
 from calib_planner.identification.structure import Structure
-from calib_planner.identification.suspicions import explain
+from calib_planner.identification.suspicions import copied_rows, explain
 from calib_planner.identification.transmission import Transmission
 from calib_planner.robot.chain import Robot
 
@@ -50,6 +50,7 @@ class Evidence:
     gate: float
     structure: tuple[Structure, ...]
     transmission: Transmission | None
+    at: FloatArray
     jacobian: FloatArray
     starts: int
     agreeing: int
@@ -96,6 +97,7 @@ def estimate_of(evidence: Evidence) -> Estimate:
         used=int(use.sum()),
         rejected=_rejected(evidence, predicted),
         suspects=_suspects(evidence, predicted),
+        copies=copied_rows(data),
         sigma=float(np.sqrt(levels.measurement**2 + levels.discrepancy**2)),
         sigma_estimate=_scatter(evidence, residuals),
         noise=levels,
@@ -173,7 +175,7 @@ def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
     held = [k for k, i in enumerate(evidence.identifiability.held) if i not in evidence.resolved]
     directions = evidence.identifiability.directions[held].T
     seen = np.linalg.norm(evidence.jacobian @ directions, axis=2).max(axis=(0, 1))
-    there = np.linalg.norm(evidence.robot.jacobian(poses) @ directions, axis=1)
+    there = np.linalg.norm(evidence.robot.jacobian(poses, evidence.at) @ directions, axis=1)
     return np.asarray((there > 10.0 * seen + BLIND).any(axis=1))
 
 

@@ -102,6 +102,8 @@ def _joint_zeros(robot: Robot) -> set[str]:
     """Names of the active parameters that act as a joint does, wherever the robot stands."""
     low, high = robot.joint_limits.T
     sample = np.random.default_rng(0).uniform(low, high, (8, len(low)))
+    # Reflectors off every axis: an unknown one starts at the tip, where the last joint moves nothing.
+    robot = robot.with_targets(robot.target_offsets + np.array([0.13, 0.17, 0.19]))
     columns, joints = robot.jacobian(sample), robot.joint_jacobian(sample)
     size = np.abs(joints).max()
     return {

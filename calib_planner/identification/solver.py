@@ -81,6 +81,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         freedom=found.freedom,
         normalised=_normalised(work, found),
         gate=_gate(found),
+        at=work.at,
         jacobian=work.jacobian,
         structure=structure,
         transmission=_transmission(work, found, structure),

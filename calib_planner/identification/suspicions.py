@@ -41,6 +41,12 @@ def check_units(robot: Robot, data: Measurements) -> None:
         raise InputError("robot", got, "lengths in metres", advice)
 
 
+def copied_rows(data: Measurements) -> int:
+    """Rows that repeat another one digit for digit: no two measurements are so alike."""
+    rows = np.hstack([data.q, np.nan_to_num(data.p, nan=np.inf).reshape(len(data), -1)])
+    return len(rows) - len(np.unique(rows, axis=0))
+
+
 def _spread(points: FloatArray) -> float:
     """Median distance from the median point [m]: blind to a few gross errors."""
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))

@@ -87,9 +87,12 @@ def _solution(e: Estimate) -> Iterator[Reason]:
 
 
 def _data(e: Estimate) -> Iterator[Reason]:
-    spare = e.chi_square.freedom
+    spare = 3 * e.used - e.rank
+    if e.copies:
+        text = f"{counted(e.copies, 'row')} repeated digit for digit"
+        yield Reason("WARN", "copies", text, "a measurement given twice counts twice: leave the copies out")
     if spare < FEWEST_SPARE:
-        text = f"only {spare} equations more than parameters"
+        text = f"{3 * e.used} coordinates for {counted(e.rank, 'parameter')}"
         advice = "too few to check noise and gross errors: measure more configurations or free fewer parameters"
         yield Reason("WARN", "too_few_measurements", text, advice)
     if not np.isfinite(e.sigma):
@@ -101,15 +104,14 @@ def _rejections(e: Estimate) -> Iterator[Reason]:
     share = len(e.rejected) / max(e.measurements, 1)
     if e.rejected:
         level = "FAIL" if share > REJECTED[1] else "WARN" if share > REJECTED[0] else "PASS"
-        text = f"{len(e.rejected)} of {e.measurements} points were rejected"
+        text = f"{len(e.rejected)} of {counted(e.measurements, 'point')} rejected"
         yield Reason(
             level, "rejected", text, "each is listed with its reason; measure those configurations again"
         )
     if e.suspects:
         rows = ", ".join(str(s["row"]) for s in e.suspects[:5]) + (" …" if len(e.suspects) > 5 else "")
-        text = (
-            f"{len(e.suspects)} points lie beyond {e.gate:.3g} standard deviations (rows {rows}), and were used"
-        )
+        number = counted(len(e.suspects), "point")
+        text = f"{number} beyond {e.gate:.3g} standard deviations (rows {rows}), used nevertheless"
         yield Reason("WARN", "suspects", text, "look at them, or use the robust loss (--loss robust)")
 
 
@@ -161,16 +163,17 @@ def _structure(e: Estimate) -> Iterator[Reason]:
 
 def _parameters(e: Estimate) -> Iterator[Reason]:
     if e.held:
-        text = f"{len(e.held)} parameters cannot be told from others and were held: {listed(e.held)}"
+        text = f"{counted(len(e.held), 'parameter')} held, not to be told from others: {listed(e.held)}"
         yield Reason("PASS", "unidentifiable", text, "no measured point depends on the choice")
     if e.nearly_dependent:
-        text = f"{len(e.nearly_dependent)} combinations are hardly seen by these data: {e.nearly_dependent[0]}"
+        number = counted(len(e.nearly_dependent), "combination")
+        text = f"{number} hardly seen by these data: {e.nearly_dependent[0]}"
         yield Reason(
             "PASS", "nearly_dependent", text, "do not read their values one by one; predictions are safe"
         )
     if e.correlations:
         a, b, c = e.correlations[0]
-        text = f"{len(e.correlations)} pairs are strongly correlated, most of all {a} and {b} ({c:+.3f})"
+        text = f"strongly correlated: {counted(len(e.correlations), 'pair')}, most of all {a} and {b} ({c:+.3f})"
         yield Reason("PASS", "correlated", text, "do not read their values one by one; predictions are safe")
 
 
@@ -183,13 +186,13 @@ def _accuracy(e: Estimate) -> Iterator[Reason]:
     required = e.required_accuracy
     if not np.isfinite(required):
         return
-    if len(per):
-        worst = float(per.max())
+    worst = float(per.max()) if len(per) else 0.0
+    if len(per) and not np.isnan(worst):
         level = "PASS" if worst <= required else "FAIL"
         text = f"predicted at the test poses: {mm(worst)} where {mm(required)} are required"
         advice = "" if level == "PASS" else _advice(e)
         yield Reason(level, "required_accuracy", text, advice)
-    elif e.validation is None and e.cross_validation is None:
+    elif not len(per) and e.validation is None and e.cross_validation is None:
         text = f"{mm(required)} are required, but nothing says where"
         yield Reason("WARN", "required_accuracy", text, "give test poses, or data to validate with")
 
@@ -237,6 +240,11 @@ def _validation(v: Validation, what: str, required: float) -> Iterator[Reason]:
 def mm(metres: float) -> str:
     """A length for people."""
     return f"{1e3 * metres:.3g} mm"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number with its noun."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def listed(names: tuple[str, ...], most: int = 4) -> str:

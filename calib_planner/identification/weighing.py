@@ -34,6 +34,8 @@ from calib_planner.identification.noise_levels import (
 from calib_planner.identification.structure import SIGNIFICANT, residual_structure
 from calib_planner.identification.work import Work
 
+LEAST_SCATTER = 1e-8
+"""Repetitions that agree better than this are copies, and say nothing of the noise [m]."""
 TINY = 1e-6
 """Share of the stand-in covariance that keeps matrices regular where the noise is estimated anew."""
 
@@ -64,7 +66,11 @@ def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
     unit = float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0))
     repeatability = float(np.sqrt(scatter)) * unit if repeats else float("nan")
     scaled = 1.0
-    if repeats >= FEWEST_REPEATS and (source == "residuals" or improbable(scatter * repeats, repeats)):
+    if (
+        repeats >= FEWEST_REPEATS
+        and repeatability > LEAST_SCATTER
+        and (source == "residuals" or improbable(scatter * repeats, repeats))
+    ):
         instrument = scatter * instrument
         scaled, source = (1.0, "repetitions") if source == "residuals" else (float(np.sqrt(scatter)), source)
         equations = work.equations(use, instrument)

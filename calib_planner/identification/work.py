@@ -11,7 +11,7 @@ from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.design.identifiability import Identifiability, analyse
 from calib_planner.identification.equations import Equations, configuration_labels, point_whitening
 from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.least_squares import gauss_newton
+from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.robust import MEDIAN
 from calib_planner.robot.chain import Robot
@@ -31,41 +31,55 @@ class Work:
     instrument: FloatArray  # (N, targets, 3, 3); the identity where nothing is known
     source: str
     labels: IntArray
-    jacobian: FloatArray  # (N, targets, 3, P) at the start
+    at: FloatArray  # (P,) deviations where it was asked what can be found
+    jacobian: FloatArray  # (N, targets, 3, P) there
     identifiability: Identifiability
     kept: tuple[int, ...]
 
     @staticmethod
     def of(problem: IdentificationProblem, robot: Robot) -> Work:
-        data = problem.data
+        data, names = problem.data, robot.parameter_names
         instrument, source = problem.instrument_covariance()
         jacobian = robot.jacobian(data.q).reshape(*data.p.shape, -1)
-        found = analyse(jacobian[data.seen].reshape(-1, jacobian.shape[-1]), robot.parameter_names)
-        labels = configuration_labels(data.q)
-        work = Work(problem, robot, instrument, source, labels, jacobian, found, found.kept)
-        return work.seeing(0.0)
+        found = analyse(jacobian[data.seen].reshape(-1, len(names)), names)
+        labels, at = configuration_labels(data.q), np.zeros(len(names))
+        work = Work(problem, robot, instrument, source, labels, at, jacobian, found, found.kept)
+        return replace(work, kept=work._with_prior(work.unit, np.zeros(len(names))))
 
     @property
     def unit(self) -> float:
         """Standard deviation of one coordinate that the instrument has [m]."""
         return float(np.sqrt(np.mean(np.einsum("kii->ki", self.instrument[self.problem.data.seen]))))
 
-    def seeing(self, sigma: float) -> Work:
-        """The same with what can be seen in spite of coordinates that scatter ``sigma`` [m]."""
-        names, prior = self.robot.parameter_names, self.problem.prior
+    def seeing(self, fit: Fit, sigma: float) -> Work:
+        """The same with what can be seen at ``fit`` in spite of coordinates that scatter ``sigma`` [m].
+
+        Asked where the fit ended: a reflector on the last axis, say, is not there before it has been found.
+        """
+        names, data = self.robot.parameter_names, self.problem.data
         placed = np.array([n.startswith(("base.", "target_")) for n in names])
         shortest = np.where(placed, 0.0, sigma / UNSEEN)
-        found = self.identifiability
-        if (np.array(found.lengths) < shortest[list(found.kept)]).any():
-            seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
-            found = analyse(seen, names, shortest=shortest)
-        kept = found.kept
-        if prior is not None and found.held:
-            # A prior is worth as many metres of the points as their scatter leaves undecided.
-            rows = (sigma or self.unit) * prior.rows(names, np.zeros(len(names)))[0]
-            seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
-            kept = analyse(np.vstack([seen, rows]), names, shortest=shortest).kept
-        return replace(self, identifiability=found, kept=kept)
+        lengths = np.abs(np.diag(fit.triangle)) * fit.scale * self.unit
+        if not (lengths < shortest[list(fit.kept)]).any():
+            return self
+        jacobian = self.robot.jacobian(data.q, fit.deviations).reshape(*data.p.shape, -1)
+        # What could not be told apart at the start stays held, though it may differ a little now.
+        held = np.isin(np.arange(len(names)), self.identifiability.held)
+        rows = jacobian[data.seen].reshape(-1, len(names))
+        found = analyse(rows, names, shortest=np.where(held, np.inf, shortest))
+        there = replace(self, at=fit.deviations, jacobian=jacobian, identifiability=found, kept=found.kept)
+        held = ~np.isin(np.arange(len(names)), self.kept)
+        return replace(there, kept=there._with_prior(sigma, np.where(held, np.inf, shortest)))
+
+    def _with_prior(self, sigma: float, shortest: FloatArray) -> tuple[int, ...]:
+        """Parameters that the data or the prior can tell."""
+        names, prior = self.robot.parameter_names, self.problem.prior
+        if prior is None or not self.identifiability.held:
+            return self.identifiability.kept
+        # A prior is worth as many metres of the points as their scatter leaves undecided.
+        rows = sigma * prior.rows(names, np.zeros(len(names)))[0]
+        seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
+        return analyse(np.vstack([seen, rows]), names, shortest=shortest).kept
 
     def equations(self, use: NDArray[np.bool_], covariance: FloatArray) -> Equations:
         """Point by point, under ``covariance`` (N, targets, 3, 3)."""
@@ -92,6 +106,7 @@ def without_unseen(work: Work, use: NDArray[np.bool_], start: Estimate | None) -
     squares = np.sum(fit.residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     spare = max(3 * count - len(work.kept), 1) / (3 * count)
     sigma = work.unit * float(np.sqrt(np.median(squares) / MEDIAN / spare))
-    work = work.seeing(sigma)
+    work = work.seeing(fit, sigma)
+    first = np.zeros(len(first))
     first[list(work.kept)] = fit.deviations[list(work.kept)]
     return work, first
