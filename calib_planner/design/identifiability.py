@@ -25,7 +25,9 @@ from calib_planner._arrays import FloatArray
 TOLERANCE = 1e-6
 """A unit column this close to the span of its predecessors is taken as dependent."""
 SMALL = 1e-4
-"""Shares of a unit column below this are not part of a combination."""
+"""Shares of a unit column below this are not named in a combination."""
+ROUNDING = 1e-9
+"""Shares below this are none."""
 NO_LEVER = 1e-12
 """A parameter that moves the targets by less than this per unit does not move them at all [m]."""
 
@@ -98,7 +100,8 @@ def analyse(
         else:
             held.append(i)
             directions.append(_direction(triangle[: len(kept), : len(kept)], share, scale, kept, i))
-    combinations = tuple(describe(d, names, first=i) for d, i in zip(directions, held, strict=True))
+    said = (np.where(np.abs(d) * scale > SMALL * scale[i], d, 0.0) for d, i in zip(directions, held, strict=True))
+    combinations = tuple(describe(d, names, first=i) for d, i in zip(said, held, strict=True))
     matrix = np.array(directions).reshape(len(held), len(names))
     return Identifiability(tuple(kept), combinations, tuple(held), matrix, tuple(lengths))
 
@@ -112,7 +115,7 @@ def _direction(triangle: FloatArray, share: FloatArray, scale: FloatArray, kept:
     direction[i] = 1.0
     if scale[i] > 0.0 and kept:
         weights = solve_triangular(triangle, share, check_finite=False)
-        weights[np.abs(weights) <= SMALL] = 0.0
+        weights[np.abs(weights) <= ROUNDING] = 0.0
         direction[kept] = -weights * scale[i] / scale[kept]
     return direction
 
