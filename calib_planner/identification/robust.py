@@ -27,6 +27,8 @@ ALARM = 0.01
 """Probability that a set without gross errors loses a point."""
 CAUCHY = 2.385
 """c: 95 % efficient for normal errors."""
+FAR = 0.05
+"""What hardly any point sees is kept this close to the start while points are selected [m | rad]."""
 MEDIAN = float(chi2.median(3))
 
 
@@ -106,9 +108,10 @@ def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, sc
         scale = max(scale, 1.0 if scale_known else 1e-300)
         new = 1.0 / (1.0 + squares / (3.0 * CAUCHY**2 * scale))
         root = np.sqrt(np.append(np.repeat(new, 3) / scale, np.ones(prior)))
-        rows = jacobian[:, columns] * root[:, None]
+        rows = np.vstack([jacobian[:, columns] * root[:, None], np.eye(len(columns)) / FAR])
+        right = np.append(residuals * root, -(deviations - start)[columns] / FAR)
         length = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-        step = np.linalg.lstsq(rows / length, residuals * root, rcond=1e-12)[0] / length
+        step = np.linalg.lstsq(rows / length, right, rcond=1e-12)[0] / length
         deviations = deviations.copy()
         deviations[columns] += step
         settled = np.abs(new - weights).max() < 1e-4
