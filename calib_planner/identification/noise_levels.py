@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from scipy.stats import f as fisher_f
 
 from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.design.discrepancy import ModelDiscrepancy
@@ -161,9 +162,19 @@ class DiscrepancyModel:
         return float(sum(parts))
 
 
-def improbable(cost: float, freedom: int) -> bool:
-    """Whether whitened residuals are larger than measurement noise explains."""
-    return freedom >= FEWEST_SPARE and float(chi2.sf(cost, freedom)) < DOUBT
+def improbable(cost: float, freedom: int, repeats: int = 0) -> bool:
+    """Whether whitened residuals are larger than measurement noise explains.
+
+    Args:
+        cost: Their sum of squares.
+        freedom: Its degrees of freedom.
+        repeats: Those of the repetitions among them that told the noise level (the test is then Fisher's, for
+            lack of fit); 0: the level is known.
+    """
+    if not repeats:
+        return freedom >= FEWEST_SPARE and float(chi2.sf(cost, freedom)) < DOUBT
+    rest = freedom - repeats
+    return rest >= FEWEST_SPARE and float(fisher_f.sf((cost - repeats) / rest, rest, repeats)) < DOUBT
 
 
 def estimate_variances(
