@@ -3,7 +3,7 @@
 After a good fit residuals do not depend on the order of measuring. Three things that happen on a shop floor make
 them; each adds columns C to the equations J ΔΠ = Δp, with unknown amounts β:
 
-*drift*   the station creeps: τ_i (v + ω × (p_i − c)), τ running from −½ to ½ over the rows, 6 columns;
+*drift*   the station creeps: τ_i (v + ω × (p_i − c)), τ running from 0 to 1 over the rows, 6 columns;
 *bump*    the station was pushed before row k: [i ≥ k] (v + ω × (p_i − c)), 6 columns;
 *reseat*  a target was seated elsewhere before row k: [i ≥ k] ∂p_i/∂(target's offset), 3 columns.
 
@@ -12,7 +12,8 @@ of C explains S = ‖P_{C⊥} r‖² with d = rank C⊥, and without a disturban
 
     F = (S/d) / ((‖r‖² − S)/(ν − d)) ~ F(d, ν − d),      ν degrees of freedom of the fit.
 
-F needs no noise level, so a noise stated too small, or a robot that no geometry describes, is no drift. The scan
+F needs no noise level, so a noise stated too small is no drift, nor is a robot that no geometry describes, if the
+residuals are whitened by what the points of one configuration share. The scan
 over k and the kinds counts as so many questions (Bonferroni). Since r ⟂ Q, S is bᵀ G⁺ b with b = Cᵀr and
 G = CᵀC − (QᵀC)ᵀ(QᵀC), sums over rows: going back from the last row, every k costs one row.
 
@@ -33,10 +34,13 @@ from scipy.stats import f as fisher_f
 
 from calib_planner._arrays import FloatArray, IntArray, check_array, frozen
 from calib_planner.identification.equations import Equations
+from calib_planner.identification.noise_levels import DiscrepancyModel, NoiseLevels
 from calib_planner.robot.chain import Robot
 
-SIGNIFICANT = 1e-4
+SIGNIFICANT = 1e-3
 """A disturbance less probable than this by chance is one."""
+HARMLESS = 1.0
+"""Standard deviations by which a parameter may move without harm: thousands of rows show the smallest warm-up."""
 FEWEST_SPARE = 6
 """Degrees of freedom that must be left beside a disturbance."""
 ABSORBED = 1e-9
@@ -68,21 +72,32 @@ class Disturbance:
     shift: float
     parameter: str
 
+    @property
+    def certain(self) -> bool:
+        """Whether it is no chance."""
+        return self.probability < SIGNIFICANT
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is no chance and moves a parameter by more than its standard deviation."""
+        return self.certain and self.shift > HARMLESS
+
 
 def check_order(
     equations: Equations,
     deviations: FloatArray,
     kept: Iterable[int],
-    factor: float = 1.0,
+    covariance: FloatArray,
     order: ArrayLike | None = None,
 ) -> tuple[Disturbance, ...]:
     """Ask for all three, the most probable disturbance first.
 
     Args:
-        equations: Of the finished fit, with its final weights; says which points count.
+        equations: Of the finished fit, whitened by all of their scatter (see ``wholly_whitened``); says which
+            points count.
         deviations: (P,) where the fit ended.
         kept: Parameters that were solved for.
-        factor: What multiplies their covariance; 1 where the noise is known.
+        covariance: (P, P) cov(Π̂), for ``shift``.
         order: (N,) when each row was measured, any unit; ``None``: in the order of the rows.
 
     Returns:
@@ -91,11 +106,37 @@ def check_order(
     Raises:
         InputError: ``order`` has another length or a value that is not finite.
     """
-    fit = _Fit.of(equations, deviations, tuple(kept), factor, order)
+    kept = tuple(kept)
+    std = np.sqrt(np.maximum(np.diag(covariance)[list(kept)], 1e-300))
+    fit = _Fit.of(equations, deviations, kept, std, order)
     found = [d for d in (fit.drift(), fit.bump(), *fit.reseats()) if d is not None]
     # The kinds are asked together: as many questions more.
     counted = [replace(d, probability=min(1.0, d.probability * len(found))) for d in found]
     return tuple(sorted(counted, key=lambda d: d.probability))
+
+
+def wholly_whitened(
+    equations: Equations, instrument: FloatArray, levels: NoiseLevels, labels: IntArray
+) -> Equations:
+    """The same points, whitened by the instrument's noise and by the discrepancy that a configuration shares.
+
+    A fit may weigh its points otherwise; the F test needs residuals that are independent if nothing moved.
+
+    Args:
+        equations: Of the fit.
+        instrument: (N, targets, 3, 3) covariance of the measurement that ``levels.scaled`` refers to [m²].
+        levels: The parts of the scatter.
+        labels: (N,) configuration of each row.
+    """
+    if not levels.discrepancy:
+        return equations
+    if levels.source in ("residuals", "repetitions"):
+        instrument = np.broadcast_to(levels.measurement**2 * np.eye(3), instrument.shape)
+    else:
+        instrument = levels.scaled**2 * instrument
+    model = DiscrepancyModel.of(equations, instrument, labels)
+    amplitudes = np.array([getattr(levels, name) for name in model.names])
+    return replace(equations, whitening=model.whitening(amplitudes**2))
 
 
 def rejected_since(seen: NDArray[np.bool_], use: NDArray[np.bool_], order: ArrayLike | None = None) -> int | None:
@@ -127,6 +168,7 @@ class _Fit:
 
     Attributes:
         robot: Where the fit ended.
+        std: (kept,) standard deviations of the parameters.
         residuals, basis: (equations + prior rows,) and (…, kept): r and Q.
         triangle: (kept, kept), JΔ = Q triangle.
         ranks: (N,) place of each row in the order of measuring.
@@ -135,7 +177,7 @@ class _Fit:
     equations: Equations
     robot: Robot
     kept: tuple[int, ...]
-    factor: float
+    std: FloatArray
     residuals: FloatArray
     basis: FloatArray
     triangle: FloatArray
@@ -147,7 +189,7 @@ class _Fit:
         equations: Equations,
         deviations: FloatArray,
         kept: tuple[int, ...],
-        factor: float,
+        std: FloatArray,
         order: ArrayLike | None,
     ) -> _Fit:
         count = len(equations.data)
@@ -159,7 +201,7 @@ class _Fit:
         # What a parameter can take up of the residuals is none of ours: a fit may have stopped a little early.
         residuals = residuals - basis @ (basis.T @ residuals)
         ranks = np.argsort(np.argsort(times, kind="stable"), kind="stable")
-        return _Fit(equations, here, kept, factor, residuals, basis, triangle, times, ranks)
+        return _Fit(equations, here, kept, std, residuals, basis, triangle, times, ranks)
 
     # ── the three kinds ──────────────────────────────────────────────────────────────────────────────
 
@@ -169,7 +211,8 @@ class _Fit:
         span = float(np.ptp(self.times[rows])) if rows.any() else 0.0
         if span == 0.0:
             return None
-        running = (self.times - self.times[rows].mean()) / span
+        # It starts right: a station that is known was measured then, one that is not takes up any constant.
+        running = (self.times - self.times[rows].min()) / span
         return self._ask("drift", self._station() * running[:, None, None, None])
 
     def bump(self) -> Disturbance | None:
@@ -241,9 +284,7 @@ class _Fit:
         scale = np.sqrt(np.diag(square))
         free = (square - absorbed.T @ absorbed) / np.outer(scale, scale)
         amounts = np.linalg.pinv(free, rcond=ABSORBED, hermitian=True) @ (along / scale) / scale
-        inverse = np.linalg.pinv(self.triangle)
-        std = np.sqrt(self.factor) * np.linalg.norm(inverse, axis=1)
-        moved = np.abs(inverse @ absorbed @ amounts) / np.maximum(std, 1e-300)
+        moved = np.abs(np.linalg.lstsq(self.triangle, absorbed @ amounts, rcond=1e-12)[0]) / self.std
         k = int(np.argmax(moved))
         return Disturbance(
             kind=kind,
