@@ -71,7 +71,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     with terminal.working("identifying"):
         estimate = _estimate(problem, held_out, args)
     settled = estimate.status != "not_converged"
-    written = write_outputs(args, estimate) if settled else {}
+    written = write_outputs(args, problem, estimate) if settled else {}
     sources = {"data": [{"file": s.path, "rows": len(s.data)} for s in rows.sources]}
     result = estimate.to_dict() | plain(placement(estimate)) | sources | written
     terminal.answer(result, partial(show_estimate, estimate, where=rows.where))

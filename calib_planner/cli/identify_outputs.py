@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +15,20 @@ from calib_planner.files.estimate_yaml import write_estimate
 from calib_planner.files.kinematics_yaml import write_kinematics
 from calib_planner.files.urdf_output import require_urdf, write_calibrated_urdf
 from calib_planner.identification.estimate import Estimate
+from calib_planner.identification.problem import IdentificationProblem
+from calib_planner.report.calibration_report import write_report
+from calib_planner.report.provenance import Provenance, provenance
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.origins import not_in_origins
 
-FLAGS = ("--output", "--urdf-output", "--kinematics-output")
+FLAGS = ("--output", "--report", "--urdf-output", "--kinematics-output")
 
 
 def add_outputs(parser: argparse.ArgumentParser) -> None:
     """One option per kind of file."""
     group = parser.add_argument_group("what to write")
     group.add_argument("--output", metavar="FILE", help="the estimate as YAML")
+    group.add_argument("--report", metavar="FILE", help="one HTML page: verdict, accuracy, 3-D view, residuals")
     group.add_argument(
         "--urdf-output", metavar="FILE", help="the calibrated URDF: the nominal one, its joints' origins changed"
     )
@@ -51,11 +57,13 @@ def check_outputs(args: argparse.Namespace, robot: Robot) -> None:
         require_urdf(robot, "--urdf-output")
 
 
-def write_outputs(args: argparse.Namespace, estimate: Estimate) -> dict[str, Any]:
+def write_outputs(args: argparse.Namespace, problem: IdentificationProblem, estimate: Estimate) -> dict[str, Any]:
     """Write what is asked for; the answer's keys about it."""
     robot = estimate.calibrated
     if args.output:
         write_estimate(args.output, estimate, "--output")
+    if args.report:
+        write_report(args.report, problem, estimate, _provenance(args), "--report")
     if args.urdf_output:
         write_calibrated_urdf(args.urdf_output, robot, field="--urdf-output")
     if args.kinematics_output:
@@ -66,9 +74,16 @@ def write_outputs(args: argparse.Namespace, estimate: Estimate) -> dict[str, Any
     return written
 
 
+def _provenance(args: argparse.Namespace) -> Provenance:
+    inputs = [("robot", args.robot), *(("data", f) for f in args.data)]
+    inputs += [("held out", f) for f in args.validate or ()]
+    command = shlex.join(["calib-planner", *sys.argv[1:]])
+    return provenance(inputs, command=command, seed=args.seed, estimate=args.output or "")
+
+
 def tell_outputs(args: argparse.Namespace, written: dict[str, Any], terminal: Terminal) -> None:
     """Say what was written and what has no place there."""
-    words = ("Estimate", "Calibrated URDF", "Kinematics")
+    words = ("Estimate", "Report", "Calibrated URDF", "Kinematics")
     for flag, word in zip(FLAGS, words, strict=True):
         if _key(flag) in written:
             terminal.note(f"{word} written to {written[_key(flag)]}")

@@ -11,7 +11,7 @@ from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.design.identifiability import Identifiability, analyse
 from calib_planner.identification.equations import Equations, configuration_labels, point_whitening
 from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.least_squares import Fit, gauss_newton
+from calib_planner.identification.least_squares import gauss_newton
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.robust import MEDIAN
 from calib_planner.robot.chain import Robot
@@ -47,27 +47,33 @@ class Work:
         return replace(work, kept=work._with_prior(work.unit, np.zeros(len(names))))
 
     @property
+    def lengths(self) -> FloatArray:
+        """(kept,) what each parameter kept adds to its predecessors, by the data or the prior [m per unit]."""
+        own = dict(zip(self.identifiability.kept, self.identifiability.lengths, strict=True))
+        return np.array([own.get(k, np.inf) for k in self.kept])
+
+    @property
     def unit(self) -> float:
         """Standard deviation of one coordinate that the instrument has [m]."""
         return float(np.sqrt(np.mean(np.einsum("kii->ki", self.instrument[self.problem.data.seen]))))
 
-    def seeing(self, fit: Fit, sigma: float) -> Work:
-        """The same with what can be seen at ``fit`` in spite of coordinates that scatter ``sigma`` [m].
+    def seeing(self, deviations: FloatArray, lengths: FloatArray, sigma: float) -> Work:
+        """The same with what can be seen at ``deviations`` in spite of coordinates that scatter ``sigma`` [m].
 
-        Asked where the fit ended: a reflector on the last axis, say, is not there before it has been found.
+        Args:
+            lengths: (kept,) what each parameter kept adds to its predecessors there.
         """
         names, data = self.robot.parameter_names, self.problem.data
         placed = np.array([n.startswith(("base.", "target_")) for n in names])
         shortest = np.where(placed, 0.0, sigma / UNSEEN)
-        lengths = np.abs(np.diag(fit.triangle)) * fit.scale * self.unit
-        if not (lengths < shortest[list(fit.kept)]).any():
+        if not (lengths < shortest[list(self.kept)]).any():
             return self
-        jacobian = self.robot.jacobian(data.q, fit.deviations).reshape(*data.p.shape, -1)
-        # What could not be told apart at the start stays held, though it may differ a little now.
+        jacobian = self.robot.jacobian(data.q, deviations).reshape(*data.p.shape, -1)
+        # What could not be told apart before stays held, though it may differ a little here.
         held = np.isin(np.arange(len(names)), self.identifiability.held)
         rows = jacobian[data.seen].reshape(-1, len(names))
         found = analyse(rows, names, shortest=np.where(held, np.inf, shortest))
-        there = replace(self, at=fit.deviations, jacobian=jacobian, identifiability=found, kept=found.kept)
+        there = replace(self, at=deviations, jacobian=jacobian, identifiability=found, kept=found.kept)
         held = ~np.isin(np.arange(len(names)), self.kept)
         return replace(there, kept=there._with_prior(sigma, np.where(held, np.inf, shortest)))
 
@@ -97,16 +103,29 @@ class Work:
 
 
 def without_unseen(work: Work, use: NDArray[np.bool_], start: Estimate | None) -> tuple[Work, FloatArray]:
-    """What can be seen in spite of the scatter that a first fit leaves, and where that fit ended."""
+    """What can be seen in spite of the scatter that a first fit leaves, and where that fit ended.
+
+    Asked at the start, since a fit may run so far along what it cannot see that it seems to see it; and again
+    where the fit ended, since a reflector on the last axis, say, is not there before it has been found.
+    """
     first = work.start_values(start)
     if work.problem.iterations <= FIRST_ITERATIONS:
         return work, first
-    fit = gauss_newton(work.equations(use, work.instrument), first, work.kept, FIRST_ITERATIONS)
+    equations = work.equations(use, work.instrument)
+    fit = gauss_newton(equations, first, work.kept, FIRST_ITERATIONS)
     count = int(use.sum())
     squares = np.sum(fit.residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     spare = max(3 * count - len(work.kept), 1) / (3 * count)
     sigma = work.unit * float(np.sqrt(np.median(squares) / MEDIAN / spare))
-    work = work.seeing(fit, sigma)
-    first = np.zeros(len(first))
-    first[list(work.kept)] = fit.deviations[list(work.kept)]
-    return work, first
+    seeing = work.seeing(work.at, work.lengths, sigma)
+    if seeing is not work:
+        fit = gauss_newton(equations, _only(seeing, first), seeing.kept, FIRST_ITERATIONS)
+    seeing = seeing.seeing(fit.deviations, np.abs(np.diag(fit.triangle)) * fit.scale * work.unit, sigma)
+    return seeing, _only(seeing, fit.deviations)
+
+
+def _only(work: Work, deviations: FloatArray) -> FloatArray:
+    """Zero but for what is kept."""
+    result = np.zeros(len(deviations))
+    result[list(work.kept)] = deviations[list(work.kept)]
+    return result
