@@ -39,8 +39,11 @@ from calib_planner.robot.chain import Robot
 
 SIGNIFICANT = 1e-3
 """A disturbance less probable than this by chance is one."""
-HARMLESS = 1.0
-"""Standard deviations by which a parameter may move without harm: thousands of rows show the smallest warm-up."""
+SUSPICIOUS = 1e-2
+"""The same where it would do much harm."""
+HARMLESS, HARMFUL = 1.0, 3.0
+"""Standard deviations that a parameter may move without harm (thousands of rows show the smallest warm-up), and
+with much of it."""
 FEWEST_SPARE = 6
 """Degrees of freedom that must be left beside a disturbance."""
 ABSORBED = 1e-9
@@ -79,8 +82,9 @@ class Disturbance:
 
     @property
     def matters(self) -> bool:
-        """Whether it is no chance and moves a parameter by more than its standard deviation."""
-        return self.certain and self.shift > HARMLESS
+        """Whether it deserves a warning: the more it moves a parameter, the less certain it need be."""
+        suspicious = self.probability < SUSPICIOUS and self.shift > HARMFUL
+        return suspicious or (self.certain and self.shift > HARMLESS)
 
 
 def check_order(

@@ -139,9 +139,13 @@ def test_bad_orders_are_refused() -> None:
             asked(*measured(0), order=order)
 
 
-def test_a_harmless_one_is_certain_and_does_not_matter() -> None:
-    found = Disturbance("drift", None, None, 1e-9, np.zeros(3), np.zeros(3), 0.5, "d1")
-    assert found.certain and not found.matters
+@pytest.mark.parametrize(
+    ("probability", "shift", "matters"),
+    [(1e-9, 0.5, False), (1e-9, 1.5, True), (5e-3, 1.5, False), (5e-3, 3.5, True), (2e-2, 9.0, False)],
+)
+def test_what_deserves_a_warning(probability: float, shift: float, matters: bool) -> None:
+    found = Disturbance("drift", None, None, probability, np.zeros(3), np.zeros(3), shift, "d1")
+    assert found.certain == (probability < 1e-3) and found.matters == matters
 
 
 def test_too_little_to_tell() -> None:
