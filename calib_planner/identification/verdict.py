@@ -179,8 +179,8 @@ def _parameters(e: Estimate) -> Iterator[Reason]:
 
 def _accuracy(e: Estimate) -> Iterator[Reason]:
     per = e.predicted_accuracy_per_test_pose
-    if len(per) and not np.isfinite(per).all():
-        count = int((~np.isfinite(per)).sum())
+    if np.isinf(per).any():
+        count = int(np.isinf(per).sum())
         text = f"the error at {count} of {len(per)} test poses rests on what the data cannot see"
         yield Reason("FAIL", "blind_test_pose", text, "measure configurations that move those parameters")
     required = e.required_accuracy
@@ -234,7 +234,8 @@ def _validation(v: Validation, what: str, required: float) -> Iterator[Reason]:
         yield Reason("WARN", "region", text, advice)
     if np.isfinite(required):
         level = "PASS" if v.rms <= required else "FAIL"
-        yield Reason(level, "required_accuracy", f"{what}: {mm(v.rms)} where {mm(required)} are required")
+        advice = "" if level == "PASS" else "free more parameters, measure more, or calibrate closer to the task"
+        yield Reason(level, "required_accuracy", f"{what}: {mm(v.rms)} where {mm(required)} are required", advice)
 
 
 def mm(metres: float) -> str:
