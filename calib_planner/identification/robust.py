@@ -29,6 +29,8 @@ CAUCHY = 2.385
 """c: 95 % efficient for normal errors."""
 FAR = 0.05
 """What hardly any point sees is kept this close to the start while points are selected [m | rad]."""
+LEAST_SCALE = 1e-8
+"""Least variance that residuals without any freedom are taken to have, in units of the instrument's."""
 MEDIAN = float(chi2.median(3))
 
 
@@ -105,7 +107,7 @@ def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, sc
         residuals, jacobian = equations.linearise(deviations)
         squares = np.sum(residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
         scale = float(np.median(squares)) / MEDIAN / freedom
-        scale = max(scale, 1.0 if scale_known else 1e-300)
+        scale = max(scale, 1.0 if scale_known else LEAST_SCALE)
         new = 1.0 / (1.0 + squares / (3.0 * CAUCHY**2 * scale))
         root = np.sqrt(np.append(np.repeat(new, 3) / scale, np.ones(prior)))
         rows = np.vstack([jacobian[:, columns] * root[:, None], np.eye(len(columns)) / FAR])
