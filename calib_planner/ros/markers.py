@@ -51,10 +51,10 @@ def plan_markers(plan: Plan, robot: Robot, stamp: int, frame_id: str) -> MarkerA
         _spheres("targets", targets, colours, TARGET * size),
     ]
     if len(shown) > 1:
-        markers.append(_marker("path", Marker.LINE_STRIP, centres, colours, Vector3(x=PATH * size)))
+        markers.append(_marker("path", Marker.LINE_STRIP, centres[:, None], colours, Vector3(x=PATH * size)))
     markers += [
         _text(str(i + 1), k, at, TEXT * size)
-        for k, (i, at) in enumerate(zip(shown.tolist(), centres, strict=True))
+        for k, (i, at) in enumerate(zip(shown.tolist(), centres.tolist(), strict=True))
     ]
     if len(plan.test_poses):
         poses = plan.test_poses[_shown(len(plan.test_poses))]
@@ -96,27 +96,24 @@ def _shades(count: int) -> FloatArray:
 
 
 def _lines(name: str, points: FloatArray, colours: FloatArray, width: float) -> Marker:
-    return _marker(name, Marker.LINE_LIST, *_flat(points, colours), Vector3(x=width))
+    return _marker(name, Marker.LINE_LIST, points, colours, Vector3(x=width))
 
 
 def _spheres(name: str, points: FloatArray, colours: FloatArray, size: float) -> Marker:
-    return _marker(name, Marker.SPHERE_LIST, *_flat(points, colours), Vector3(x=size, y=size, z=size))
-
-
-def _flat(points: FloatArray, colours: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, K, 3) and (N, 4) as rows (N·K, 3) and (N·K, 4)."""
-    return points.reshape(-1, 3), np.repeat(colours, points.shape[1], axis=0)
+    return _marker(name, Marker.SPHERE_LIST, points, colours, Vector3(x=size, y=size, z=size))
 
 
 def _marker(name: str, kind: int, points: FloatArray, colours: FloatArray, scale: Vector3) -> Marker:
+    """A marker of points (N, K, 3), N groups that have a colour (N, 4) each."""
     marker = Marker(ns=name, type=kind, scale=scale, color=_colour(colours[0]))
     marker.pose.orientation.w = 1.0
-    marker.points = [_point(row) for row in points.tolist()]
-    marker.colors = [_colour(row) for row in colours.tolist()]
+    marker.points = [_point(row) for row in points.reshape(-1, 3).tolist()]
+    # Making messages is what takes the time here: the points of a group share one colour.
+    marker.colors = [one for row in colours.tolist() for one in [_colour(row)] * points.shape[1]]
     return marker
 
 
-def _text(text: str, number: int, at: FloatArray, size: float) -> Marker:
+def _text(text: str, number: int, at: Sequence[float], size: float) -> Marker:
     marker = Marker(ns="order", id=number, type=Marker.TEXT_VIEW_FACING, text=text)
     marker.scale.z = size
     marker.color = _colour([1.0, 1.0, 1.0, 1.0])
@@ -126,8 +123,7 @@ def _text(text: str, number: int, at: FloatArray, size: float) -> Marker:
 
 
 def _point(row: Sequence[float]) -> Point:
-    x, y, z = map(float, row)
-    return Point(x=x, y=y, z=z)
+    return Point(x=row[0], y=row[1], z=row[2])
 
 
 def _colour(row: Sequence[float]) -> ColorRGBA:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from calib_planner.errors import CalibPlannerError, FileFormatError
 from calib_planner.files.urdf_speeds import parse_speed_limits
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.urdf import parse_urdf
-from calib_planner.ros.settings import PlannerParameters, load_shipped
+from calib_planner.ros.settings import PlannerParameters, load_shipped, unknown_words
 
 TOPIC = "robot_description"
 LONGEST_TEXT = 4_000_000
@@ -55,8 +56,15 @@ def shipped_model(name: str, parameters: str | Sequence[str], unknown: str) -> M
     Raises:
         UnknownNameError: Not a shipped robot, or it has no such parameters.
     """
-    robot = load_shipped(name, parameters, unknown)
+    words = unknown_words(unknown)
+    robot = _loaded(name).with_parameters(parameters, words)
     return Model(robot, _no_limits(robot))
+
+
+@lru_cache(maxsize=16)
+def _loaded(name: str) -> Robot:
+    """Read once: a request that names a robot should not wait for its file."""
+    return load_shipped(name, "full")
 
 
 def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model:

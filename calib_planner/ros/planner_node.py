@@ -180,11 +180,15 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         return response
 
     def _publish(self, message: PlanMessage, result: Answer, stamp: int) -> None:
-        """The plan, how to drive it, and how it looks."""
+        """The plan; how to drive it and how it looks follow, since whoever asked need not wait for them."""
+        self._publishers_of[0].publish(message)
+        if self.executor is not None:
+            self.executor.create_task(self._safe(self._publish_more), result, stamp)
+
+    def _publish_more(self, result: Answer, stamp: int) -> None:
         assert result.plan is not None and result.model is not None
         found, robot, settings = result.plan, result.model.robot, self.settings.value
-        plans, trajectories, pictures = self._publishers_of
-        plans.publish(message)
+        _, trajectories, pictures = self._publishers_of
         pace = pace_of(robot, settings.joint_speed, settings.slide_speed, result.model.speeds, settings.dwell)
         try:
             trajectories.publish(trajectory_message(found, robot, pace, stamp, settings.frame_id))

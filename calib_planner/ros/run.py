@@ -23,8 +23,8 @@ from calib_planner.errors import CalibPlannerError
 def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = None) -> int:
     """Make the node, spin it, clean up once.
 
-    rclpy's own handlers shut the context down, which ends the spinning. Python's are replaced, so that a
-    second Ctrl-C during the clean-up does no harm.
+    rclpy's own handlers shut the context down, and Python's are replaced, so that a second Ctrl-C during the
+    clean-up does no harm. See ``Ended`` for how the spinning comes to its end.
 
     Args:
         threads: 1 for a node whose callbacks are all short: rclpy's executor of many threads costs several
@@ -33,19 +33,19 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
     Returns:
         Exit status.
     """
-    asked: list[int] = []
+    ended = Ended()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: asked.append(n))
+        signal.signal(number, ended.note)
     rclpy.init(args=None if args is None else list(args))
     node = None
     try:
-        if asked:
+        if ended.done():
             return 0
         node = make()
-        executor = _executor(threads)
+        ended.executor = executor = _executor(threads)
         executor.add_node(node)
-        while rclpy.ok() and not asked:
-            spin_once(executor)
+        while rclpy.ok() and not ended.done():
+            spin_once(executor, ended=ended)
         return 0
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
@@ -54,26 +54,60 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         return 1
     except Exception:
         # The context may be shut down while a callback is using it: that is the end asked for, not a fault.
-        if asked or not rclpy.ok():
+        if ended.done() or not rclpy.ok():
             return 0
         raise
     finally:
         close = getattr(node, "close", None)
-        ended = close() if close is not None else True
+        in_time = close() if close is not None else True
         rclpy.try_shutdown()
-        if not ended:
+        if not in_time:
             # Python would wait for the thread that is still at work.
             os._exit(0)
 
 
-def spin_once(executor: Executor, timeout: float | None = None) -> None:
+class Ended:
+    """Whether the process was told to end; a future, as far as rclpy's executors use one.
+
+    rclpy wakes the executor before it shuts the context down. If the executor looks at the context in between, it
+    goes back to sleep, and nothing wakes it again. It does look at its future, though, and Python calls ``note``
+    before the executor's next step.
+    """
+
+    def __init__(self) -> None:
+        self._noted = False
+        self.executor: Executor | None = None
+
+    def note(self, number: int, frame: object) -> None:
+        """A signal handler."""
+        self._noted = True
+        if self.executor is not None:
+            self.executor.wake()
+
+    def done(self) -> bool:
+        """Called by rclpy."""
+        return self._noted
+
+    def add_done_callback(self, callback: object) -> None:
+        """Called by rclpy at every step, to be woken; ``note`` does that by itself."""
+
+
+NEVER = Ended()
+
+
+def spin_once(executor: Executor, timeout: float | None = None, ended: Ended = NEVER) -> None:
     """Do what is next.
+
+    Args:
+        executor: Whose turn it is.
+        timeout: Longest time to wait for something [s]; ``None``: any.
+        ended: Ends the waiting.
 
     Where there are several threads, one may destroy a publisher (transition ``cleanup``) just when another
     collects what to wait for; rclpy's executor then raises, and is as good as new when called again.
     """
     try:
-        executor.spin_once(timeout_sec=timeout)
+        executor.spin_once_until_future_complete(ended, timeout)
     except InvalidHandle:
         return
 
