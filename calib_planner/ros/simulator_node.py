@@ -22,12 +22,11 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from calib_planner.design.plan import Plan
-from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.errors import CalibPlannerError, InputError
 from calib_planner.files.instrument_yaml import read_instrument
 from calib_planner.robot.catalogue import config_folder
-from calib_planner.robot.chain import Robot
 from calib_planner.ros.conversions import joints_message, plan_from_message, point_message
+from calib_planner.ros.execution import check_executable
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.qos import SENSOR_OUT
 from calib_planner.ros.run import run
@@ -40,8 +39,6 @@ FEEDBACK_PERIOD = 0.1
 """Time between two looks at the execution [s]."""
 PATIENCE = 2.0
 """Time that an execution gets to end when it is stopped [s]."""
-MOST_STANDSTILLS = 100_000
-"""Standstills of one plan; at a second each that is more than a day."""
 
 
 @dataclass(frozen=True)
@@ -212,27 +209,6 @@ def make_world(chosen: SimulatorParameters) -> World:
     if chosen.instrument != "sigma":
         instrument = read_instrument(config_folder() / "instruments" / f"{chosen.instrument}.yaml")
     return World(SimulatedCell(robot, errors, chosen.sigma, instrument), chosen, chosen.seed)
-
-
-def check_executable(plan: Plan, robot: Robot) -> None:
-    """Refuse a plan that this robot cannot execute.
-
-    Raises:
-        InputError: Other robot or joints, or a configuration outside the limits.
-    """
-    if plan.robot != robot.name:
-        raise UnknownNameError("plan.robot", plan.robot, [robot.name])
-    if plan.joint_names != robot.joint_names:
-        raise InputError("plan.joint_names", ", ".join(plan.joint_names), ", ".join(robot.joint_names))
-    if plan.measurements > MOST_STANDSTILLS:
-        expected = f"at most {MOST_STANDSTILLS}"
-        raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
-    low, high = robot.joint_limits.T
-    outside = (plan.configurations < low - 1e-6) | (plan.configurations > high + 1e-6)
-    if outside.any():
-        i, j = (int(k) for k in np.argwhere(outside)[0])
-        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
-        raise InputError(f"plan.configurations, row {i}", f"{plan.configurations[i, j]:.4f}", expected)
 
 
 def main(args: Sequence[str] | None = None) -> int:
