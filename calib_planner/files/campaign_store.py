@@ -86,11 +86,18 @@ class StoredCampaign:
 
 
 class CampaignStore:
-    """An open store; ``open_store`` makes one."""
+    """An open store; ``open_store`` makes one.
+
+    Attributes:
+        path: The file; ``None`` in memory.
+        model: Which robot it belongs to.
+        trouble: Why the last attempt to write failed; empty once one succeeded.
+    """
 
     def __init__(self, path: Path | None, database: sqlite3.Connection, model: StoredModel) -> None:
         self.path, self.model, self._database = path, model, database
         self._file = None if path is None else identity(path)
+        self.trouble = ""
 
     def close(self) -> None:
         """Let the file go; what was committed is there already."""
@@ -185,6 +192,15 @@ class CampaignStore:
                 for decision in decisions:
                     _decide(write, campaign, decision.number, decision)
 
+    def probe(self) -> bool:
+        """Try to write; whether that works is in ``trouble``, too."""
+        try:
+            with self._writing() as write:
+                write.execute("UPDATE current SET campaign = campaign")
+        except StoreError:
+            return False
+        return True
+
     # ── inside ───────────────────────────────────────────────────────────────────────────────────────
 
     def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Decision]) -> StoredCampaign:
@@ -223,18 +239,21 @@ class CampaignStore:
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """One transaction: committed to disk, or as if it had never been."""
-        if self.path is not None and identity(self.path) != self._file:
-            raise StoreError(self.path, "the file was moved, removed or replaced", "put it back")
         try:
+            if self.path is not None and identity(self.path) != self._file:
+                raise StoreError(self.path, "the file was moved, removed or replaced", "put it back")
             self._database.execute("BEGIN IMMEDIATE")
             yield self._database
             self._database.execute("COMMIT")
         except sqlite3.Error as error:
             self._roll_back()
+            self.trouble = str(error)
             raise StoreError(self.path, str(error), "make space or repair the disk; it is tried again") from None
-        except BaseException:
+        except BaseException as error:
             self._roll_back()
+            self.trouble = str(error)
             raise
+        self.trouble = ""
 
     def _roll_back(self) -> None:
         # SQLite may have rolled back itself; a roll-back that fails is made up for by the next BEGIN.
@@ -250,7 +269,7 @@ class UnavailableStore(CampaignStore):
 
     def __init__(self, model: StoredModel, error: StoreError) -> None:
         super().__init__(None, sqlite3.connect(":memory:", check_same_thread=False), model)
-        self.error = error
+        self.error, self.trouble = error, str(error)
 
     def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
         return []

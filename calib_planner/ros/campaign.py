@@ -1,26 +1,39 @@
 """What has been measured of a plan, and the estimate it gives: the identifier without ROS.
 
-A campaign belongs to one plan (or to none); a plan with another name begins a new one.
+A campaign belongs to one plan (or to none); a plan with another name begins a new one, and a plan that comes back
+finds what was measured of it. Everything is in the store before it is in force here, so that a campaign made from
+the same store is this campaign again.
+
+Which points to believe is decided by all measurements together, from the beginning, every time one comes or goes
+(χ² against the estimate of the others, ``identification.robust``): an outlier of today may be vindicated by
+tomorrow's measurements. What changes is told and written, nothing is deleted. The estimate depends on which
+measurements there are and on nothing else, which makes it the same after a restart.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_planner._arrays import FloatArray
 from calib_planner.design.plan import Plan
-from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
+from calib_planner.errors import CalibPlannerError, InputError, NotEnoughDataError, StoreError, UnknownNameError
+from calib_planner.files.campaign_records import ACCEPTED, KEPT, OUTLIER, UNDONE, Decision
+from calib_planner.files.campaign_store import CampaignStore, StoredCampaign
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.solver import identify
-from calib_planner.instrument.standstill import Standstill
+from calib_planner.instrument.standstill import Rejection, Standstill
 from calib_planner.instrument.standstill_noise import mean_std
 from calib_planner.robot.chain import Robot
+
+MOST_REJECTIONS = 10_000
+"""Rejected standstills of a campaign that are written; more are only counted: nobody shall fill the disk."""
+NOT_STORED = "not_stored"
 
 
 @dataclass(frozen=True)
@@ -42,112 +55,180 @@ class Matching:
     most: int = 5000
 
 
-@dataclass(frozen=True, eq=False)
-class Decision:
-    """What becomes of a standstill.
-
-    Attributes:
-        found: The standstill.
-        status: ``accepted``, ``not_in_plan`` or ``undone``.
-        reason: In words; empty when accepted.
-        index: Row of the plan, or ``None``.
-        repetition: Number of this measurement at its configuration, from 0.
-    """
-
-    found: Standstill
-    status: str
-    reason: str
-    index: int | None
-    repetition: int
-
-
 @dataclass(frozen=True)
 class TooFew:
-    """No estimate yet: ``missing`` is how many configurations at least are still needed."""
+    """No estimate yet: ``missing`` is how many configurations at least are still needed; 0: it failed."""
 
     missing: int
     message: str
 
 
-@dataclass
 class Campaign:
     """Measurements of one plan by one robot.
 
-    Attributes:
+    Args:
         nominal: The robot, its active parameters being the identifier's own choice.
         follow: Chooses the robot's active parameters for a plan.
+        store: Where everything is kept; the campaign in it goes on.
+
+    Attributes:
         plan_id, plan: The plan, if any.
         robot: The robot whose parameters are identified now.
-        accepted: What is used, in the order of measuring.
-        rejected: Number of standstills that were not used.
+        kept: What the identification is given, in the order of measuring: accepted, or an outlier for now.
+        newest: The last estimate, of what is in ``kept``; ``None`` if it has to be made anew.
+
+    Raises:
+        CalibPlannerError: What the store holds does not fit the robot.
     """
 
-    nominal: Robot
-    follow: Callable[[Plan], Robot]
-    plan_id: str = ""
-    plan: Plan | None = None
-    accepted: list[Decision] = field(default_factory=list)
-    rejected: int = 0
+    def __init__(self, nominal: Robot, follow: Callable[[Plan], Robot], store: CampaignStore) -> None:
+        self.nominal, self.robot, self.follow, self.store = nominal, nominal, follow, store
+        self.kept: list[Decision] = []
+        self.newest: Estimate | TooFew | None = None
+        self._unsaved: dict[int, Decision] = {}
+        self._others: Counter[str] = Counter()
+        self._enter(store.current() or StoredCampaign(0, "", None, ()))
 
-    def __post_init__(self) -> None:
-        self.robot = self.nominal
+    # ── plans ────────────────────────────────────────────────────────────────────────────────────────
 
-    def begin(self, plan_id: str, plan: Plan) -> bool:
-        """Take a plan; ``False`` if it is the current one. Measurements of another plan are dropped.
+    def begin(self, plan_id: str, plan: Plan, tolerance: float, *, keep: bool = False) -> bool:
+        """Take a plan; ``False`` if it is the current one.
+
+        A plan that cannot be written now is taken all the same, and written before the first measurement.
+
+        Args:
+            tolerance: See ``Matching``.
+            keep: A plan that is new goes on with the measurements of the one before.
 
         Raises:
-            InputError: The plan is for another robot.
+            InputError: The plan is for another robot, or another plan has its name.
         """
-        if self.plan is not None and plan_id == self.plan_id:
-            return False
         if plan.robot != self.nominal.name:
-            raise UnknownNameError("plan.robot", plan.robot, [self.nominal.name])
+            raise UnknownNameError("plan.robot", plan.robot[:100], [self.nominal.name])
         if plan.joint_names != self.nominal.joint_names:
-            raise InputError("plan.joint_names", plan.joint_names, ", ".join(self.nominal.joint_names))
-        robot = self.follow(plan)
-        self.robot, self.plan_id, self.plan = robot, plan_id, plan
-        self.reset()
+            got = ", ".join(plan.joint_names)[:200]
+            raise InputError("plan.joint_names", got, ", ".join(self.nominal.joint_names))
+        self.follow(plan)
+        known = self.store.find(plan_id, plan)
+        if self.plan is not None and self.plan_id == plan_id:
+            return False
+        carried = _matched_anew(self.kept, plan, tolerance) if keep and known is None else ()
+        try:
+            self._enter(self.store.begin(plan_id, plan, carried))
+        except StoreError:
+            self._enter(replace(known or StoredCampaign(0, plan_id, plan, carried), number=0))
         return True
 
+    def _enter(self, stored: StoredCampaign) -> None:
+        robot = self.nominal if stored.plan is None else self.follow(stored.plan)
+        self.number, self.plan_id, self.plan, self.robot = stored.number, stored.plan_id, stored.plan, robot
+        self.kept = [d for d in stored.decisions if d.status in KEPT]
+        self._others = Counter(d.status for d in stored.decisions if d.status not in KEPT)
+        self.newest, self._unsaved = None, {}
+
+    def _ensure_begun(self) -> int:
+        """Number of the campaign, which is in the store from now on."""
+        if self.number == 0:
+            self.number = self.store.begin(self.plan_id, self.plan, self.kept).number
+        return self.number
+
     def reset(self) -> int:
-        """Forget all measurements; returns how many."""
-        count = len(self.accepted)
-        self.accepted, self.rejected = [], 0
+        """Leave all measurements behind; returns how many.
+
+        Raises:
+            StoreError: That cannot be written; nothing was changed.
+        """
+        count = len(self.kept)
+        self._enter(self.store.restart(self.plan_id, self.plan))
         return count
 
-    def undo(self) -> Decision | None:
-        """Withdraw the newest measurement."""
-        if not self.accepted:
-            return None
-        last = self.accepted.pop()
-        self.rejected += 1
-        return Decision(last.found, "undone", "withdrawn on request", last.index, last.repetition)
+    # ── measurements come and go ─────────────────────────────────────────────────────────────────────
 
-    def take(self, found: Standstill, how: Matching) -> Decision:
-        """Decide on a standstill, and keep it if it is accepted."""
+    def take(
+        self, found: Standstill, how: Matching, frame: str = "", objection: tuple[str, str] | None = None
+    ) -> Decision:
+        """Decide on a standstill, and keep it if it is accepted and written.
+
+        Args:
+            frame: Frame of its points.
+            objection: Status and reason of a rejection that was decided elsewhere.
+        """
         index, reason = self._match(found.joints, how)
+        if objection is not None:
+            return self._reject(Decision(found, *objection, index, 0, frame=frame))
         if reason and not how.accept_unplanned:
-            self.rejected += 1
-            return Decision(found, "not_in_plan", reason, None, 0)
-        if len(self.accepted) >= how.most:
-            self.rejected += 1
+            return self._reject(Decision(found, "not_in_plan", reason, None, 0, frame=frame))
+        if len(self.kept) >= how.most:
             reason = f"{how.most} measurements are kept at most: raise most_measurements or call ~/reset"
-            return Decision(found, "not_in_plan", reason, index, 0)
-        decision = Decision(found, "accepted", "", index, self.done()[index])
-        self.accepted.append(decision)
+            return self._reject(Decision(found, "not_in_plan", reason, index, 0, frame=frame))
+        decision = Decision(found, ACCEPTED, "", index, self.done()[index], frame=frame)
+        try:
+            decision = replace(decision, number=self.store.record(self._ensure_begun(), decision))
+        except StoreError as error:
+            self._others[NOT_STORED] += 1
+            return decision.now(NOT_STORED, f"not stored: {error}")
+        self.kept.append(decision)
+        self.newest = None
         return decision
 
+    def refuse(self, found: Rejection, frame: str = "") -> Decision:
+        """Note a standstill that was none."""
+        return self._reject(Decision(found, found.reason.value, found.message, None, 0, frame=frame))
+
+    def _reject(self, decision: Decision) -> Decision:
+        """Count it, and write it if that is possible: it was not promised to anybody."""
+        self._others[decision.status] += 1
+        if self._others.total() > MOST_REJECTIONS:
+            return decision
+        try:
+            return replace(decision, number=self.store.record(self._ensure_begun(), decision))
+        except StoreError:
+            return decision
+
+    def undo(self, number: int = 0) -> Decision | None:
+        """Withdraw a measurement, 0 for the newest; ``None`` if there is no such measurement in use.
+
+        Raises:
+            StoreError: That cannot be written; nothing was changed.
+        """
+        last = next((d for d in reversed(self.kept) if number in (0, d.number)), None)
+        if last is None:
+            return None
+        undone = last.now(UNDONE, "withdrawn on request")
+        self.store.decide(self._ensure_begun(), [undone])
+        self.kept.remove(last)
+        self._unsaved.pop(last.number, None)
+        self._others[UNDONE] += 1
+        self.newest = None
+        return undone
+
+    # ── what there is ────────────────────────────────────────────────────────────────────────────────
+
+    @property
+    def accepted(self) -> list[Decision]:
+        """What is used, in the order of measuring."""
+        return [d for d in self.kept if d.status == ACCEPTED]
+
+    @property
+    def rejections(self) -> Counter[str]:
+        """Standstills that are not used, by status."""
+        return self._others + Counter(d.status for d in self.kept if d.status != ACCEPTED)
+
     def done(self) -> Counter[int | None]:
-        """Measurements per row of the plan."""
+        """Accepted measurements per row of the plan."""
         return Counter(d.index for d in self.accepted)
+
+    def missing(self) -> list[int]:
+        """Rows of the plan that were not measured as often as planned, in its order."""
+        if self.plan is None:
+            return []
+        done = self.done()
+        return [i for i, r in enumerate(self.plan.repetitions.tolist()) if done[i] < r]
 
     @property
     def complete(self) -> bool:
         """Whether every planned configuration was measured as often as planned."""
-        if self.plan is None:
-            return False
-        done = self.done()
-        return all(done[i] >= r for i, r in enumerate(self.plan.repetitions))
+        return self.plan is not None and not self.missing()
 
     def _match(self, joints: FloatArray, how: Matching) -> tuple[int | None, str]:
         """Row of the plan and, if there is none, why. Unfinished rows come first, then the nearest."""
@@ -155,38 +236,109 @@ class Campaign:
         if plan is None:
             return None, "there is no plan: request one, or set accept_unplanned"
         distance = np.abs(plan.configurations - joints).max(axis=1)
-        near = np.flatnonzero(distance <= how.tolerance)
-        if not len(near):
+        best = _nearest_row(plan, distance, self.done(), how.tolerance)
+        if best is None:
             i = int(np.argmin(distance))
             text = f"the nearest planned configuration, {i}, is {distance[i]:.4f} rad away"
             return None, f"{text}, plan_tolerance is {how.tolerance:g}: check the pose"
-        done = self.done()
-        best = min(near, key=lambda i: (done[int(i)] >= plan.repetitions[i], distance[i]))
-        return int(best), ""
+        return best, ""
 
     # ── the estimate ─────────────────────────────────────────────────────────────────────────────────
 
     def measurements(self, how: Matching) -> Measurements | None:
-        """What is used, as the library's value; ``None`` if there is nothing."""
-        if not self.accepted:
+        """What is kept, outliers and all, as the library's value; ``None`` if there is nothing."""
+        if not self.kept:
             return None
-        found = [d.found for d in self.accepted]
+        found = [d.standstill for d in self.kept]
         points = np.array([f.points for f in found])
         std = mean_std(found, how.sigma, how.repeatability)
         q = np.array([f.joints for f in found])
         return Measurements(self.robot.joint_names, q, points, std)
 
-    def estimate(self, how: Matching) -> Estimate | TooFew:
-        """Identify with what there is."""
+    def problem(self, how: Matching) -> IdentificationProblem:
+        """What is asked of the identification.
+
+        Raises:
+            NotEnoughDataError: Nothing was measured yet.
+        """
         data = self.measurements(how)
         poses = self.plan.test_poses if self.plan is not None and len(self.plan.test_poses) else None
+        if data is None:
+            raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
+        # At every standstill: what takes seconds is left to the analysis of the finished campaign.
+        quick = {"joint_corrections": "off", "starts": 0}
+        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses, **quick)  # type: ignore[arg-type]
+
+    def estimate(self, how: Matching) -> Estimate | TooFew:
+        """Identify with what there is."""
         try:
-            if data is None:
-                raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-            # At every standstill: what takes seconds is left to the analysis of the finished campaign.
-            problem = IdentificationProblem(self.robot, data, test_poses=poses, joint_corrections="off", starts=0)
-            return identify(problem)
+            self.newest = identify(self.problem(how))
         except NotEnoughDataError as error:
             each = 3 * len(self.robot.targets)
-            missing = max(-(-(error.need - error.have) // each), 1)
-            return TooFew(missing, f"{missing} more configurations needed at least: {error}")
+            missing = max(-(-(error.need - error.have) // each), 0)
+            text = f"{missing} more configurations needed at least: {error}" if missing else str(error)
+            self.newest = TooFew(missing, text)
+        except (CalibPlannerError, ArithmeticError, ValueError) as error:
+            self.newest = TooFew(0, f"identification failed: {error}")
+        return self.newest
+
+    def judge(self) -> list[Decision]:
+        """Those of ``kept`` about which the newest estimate thinks otherwise than before.
+
+        What cannot be written now is written with the next: the data it follows from are there.
+        """
+        rejected = self.newest.rejected if isinstance(self.newest, Estimate) else ()
+        changed = []
+        for row, before in enumerate(self.kept):
+            own = [r for r in rejected if r["row"] == row]
+            unused = tuple(sorted(int(r["target"]) - 1 for r in own))
+            seen = int((before.standstill.samples > 0).sum())
+            status = OUTLIER if own and len(own) == seen else ACCEPTED
+            if (status, unused) != (before.status, before.unused):
+                self.kept[row] = before.now(status, _reasons(own), unused)
+                changed.append(self.kept[row])
+        self._unsaved |= {d.number: d for d in changed}
+        if self._unsaved:
+            try:
+                self.store.decide(self._ensure_begun(), list(self._unsaved.values()))
+                self._unsaved = {}
+            except StoreError:
+                return changed
+        return changed
+
+
+def condition_of(estimate: Estimate) -> float:
+    """Condition number of the identified parameters, each in units of its own standard deviation; NaN if unknown.
+
+    The square root of that of their correlations: as for a Jacobian, 1 is best.
+    """
+    variances = np.diag(estimate.covariance)
+    found = np.isfinite(variances) & (variances > 0)
+    if not found.any():
+        return float("nan")
+    scale = np.sqrt(variances[found])
+    values = np.linalg.eigvalsh(estimate.covariance[np.ix_(found, found)] / np.outer(scale, scale))
+    return float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else float("inf")
+
+
+def _reasons(rejected: Iterable[dict[str, object]]) -> str:
+    """Why points are not used, in words."""
+    return "; ".join(f"target {r['target']}: {r['reason']}" for r in rejected)
+
+
+def _nearest_row(plan: Plan, distance: FloatArray, done: Counter[int | None], tolerance: float) -> int | None:
+    """Row of a plan within ``tolerance``: one that is not finished if there is one, then the nearest."""
+    near = np.flatnonzero(distance <= tolerance)
+    return min((int(i) for i in near), key=lambda i: (done[i] >= plan.repetitions[i], distance[i]), default=None)
+
+
+def _matched_anew(kept: Iterable[Decision], plan: Plan, tolerance: float) -> tuple[Decision, ...]:
+    """Measurements of another plan, at the rows of this one; those of none stay in use, unplanned."""
+    done: Counter[int | None] = Counter()
+    carried = []
+    for decision in kept:
+        distance = np.abs(plan.configurations - decision.standstill.joints).max(axis=1)
+        index = _nearest_row(plan, distance, done, tolerance)
+        carried.append(replace(decision, index=index, repetition=done[index]))
+        done[index] += 1
+    return tuple(carried)

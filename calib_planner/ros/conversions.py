@@ -55,6 +55,8 @@ MEASUREMENT_STATUS = {
     "outlier": Measurement.REJECTED_OUTLIER,
     "bad_joints": Measurement.REJECTED_BAD_JOINTS,
     "undone": Measurement.REJECTED_UNDONE,
+    "not_stored": Measurement.REJECTED_NOT_STORED,
+    "clock_offset": Measurement.REJECTED_CLOCK_OFFSET,
 }
 
 
@@ -222,9 +224,12 @@ def measurement_message(
     plan_id: str = "",
     index: int | None = None,
     repetition: int = 0,
+    number: int = 0,
+    unused: Sequence[int] = (),
 ) -> Measurement:
     """What became of a standstill; ``status`` is a key of ``MEASUREMENT_STATUS``."""
     message = Measurement(
+        id=number,
         plan_id=plan_id,
         configuration_index=Measurement.UNPLANNED if index is None else index,
         repetition=repetition,
@@ -233,6 +238,7 @@ def measurement_message(
         samples=found.samples.tolist(),
         duration=(found.stop - found.start) / NANO,
         status=MEASUREMENT_STATUS[status],
+        unused_targets=list(unused),
         reason=reason,
     )
     message.header.stamp = stamp_message((found.start + found.stop) // 2)
@@ -272,7 +278,7 @@ class ReceivedEstimate:
 
 
 def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
-    """An ``Estimate`` as message; ``others`` sets further fields (``plan_id``, ``complete``, …)."""
+    """An ``Estimate`` as message; ``others`` sets further fields (``plan_id``, ``condition``, …)."""
     numbers = {
         "nominal": estimate.nominal,
         "value": estimate.values,
@@ -296,6 +302,10 @@ def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
         "residual_rms_after": float(estimate.residual_after.rms),
         "status": ESTIMATE_STATUS.get(estimate.status, CalibrationEstimate.STATUS_ERROR),
         "message": estimate.message,
+        "condition": float("nan"),
+        "outliers": len(estimate.rejected),
+        "verdict": estimate.verdict.level,
+        "reasons": [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in estimate.verdict.reasons],
     }
     return CalibrationEstimate(**(fields | others))
 

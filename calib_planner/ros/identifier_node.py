@@ -1,210 +1,336 @@
 """Node ``calibration_identifier``: hears joints and tracker points, publishes the calibrated parameters.
 
-Standstills are found by ``instrument.standstill``, matched to the plan and identified by ``campaign``; this
-file only carries messages. Identification takes some 10 ms and runs in the callback that completes a
-standstill.
+Standstills are found in ``streams``, matched to the plan, stored and identified in ``campaign``, saved in
+``saving``; this file only carries messages. All callbacks take turns in one thread: a standstill costs a commit
+to disk and an identification, some 20 ms together, for which the queues of the streams are deep enough by far.
+
+A measurement is acknowledged on ``~/measurements`` after it is on the disk. As long as that cannot be written,
+standstills are rejected as not stored and the node goes on; it looks every time, and with every message on
+``/diagnostics``, whether it can be written again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
+from calib_planner_msgs.srv import UndoMeasurement
 from geometry_msgs.msg import PointStamped
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.node import Node
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from calib_planner.design.plan import Plan
-from calib_planner.errors import CalibPlannerError, InputError
-from calib_planner.instrument.standstill import Rejection, Standstill, StandstillDetector
-from calib_planner.robot.chain import Robot
+from calib_planner import __version__
+from calib_planner.errors import CalibPlannerError, InputError, StoreError
+from calib_planner.files.campaign_records import ACCEPTED
+from calib_planner.files.campaign_store import UnavailableStore, open_store
+from calib_planner.instrument.standstill import Rejection, Standstill
 from calib_planner.ros import saving
-from calib_planner.ros.campaign import Campaign, Decision, Matching, TooFew
-from calib_planner.ros.conversions import (
-    ESTIMATE_STATUS,
-    estimate_to_message,
-    joints_from_message,
-    measurement_message,
-    nanoseconds,
-    plan_from_message,
-    point_from_message,
-    stamp_message,
-)
-from calib_planner.ros.parameters import NodeParameters
-from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_IN
+from calib_planner.ros.campaign import Campaign, Matching
+from calib_planner.ros.conversions import ReceivedPlan, plan_from_message
+from calib_planner.ros.diagnostics import diagnostics
+from calib_planner.ros.identified_model import IdentifiedModel, first_model, heard_model
+from calib_planner.ros.identifier_output import IdentifierOutput
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.model_source import TOPIC
+from calib_planner.ros.qos import LATCHED, STREAM_IN
 from calib_planner.ros.run import run
-from calib_planner.ros.settings import IdentifierParameters, load_shipped
+from calib_planner.ros.settings import IdentifierParameters
+from calib_planner.ros.streams import Intake
+
+JOINTS = "joint_states"
 
 
-class IdentifierNode(Node):
+class IdentifierNode(ManagedNode[IdentifierParameters]):
     """See the module."""
 
     THREADS = 1
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        super().__init__("calibration_identifier", context=context, parameter_overrides=list(overrides))
-        self.settings = NodeParameters(self, IdentifierParameters())
+        self._model: IdentifiedModel | None = None
+        self._campaign: Campaign | None = None
+        self._intake: Intake | None = None
+        self._plan: ReceivedPlan | None = None
+        self._waiting = f"no robot yet: publish a URDF on {TOPIC} (latched), or set the parameter robot"
+        super().__init__("calibration_identifier", IdentifierParameters(), context, overrides)
+
+    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
+
+    def configure(self) -> None:
+        """Load the robot and the campaign in the store, offer services, listen for plans."""
         chosen = self.settings.value
-        self._campaign = Campaign(_robot(chosen, chosen.parameters or "lengths+offsets"), self._follow)
-        robot = self._campaign.nominal
-        self._detector = StandstillDetector(len(robot.joint_names), len(robot.targets), chosen.standstill)
-        self._frame = "tracker"
-        self._newest = 0
-        self._estimate_publisher = self.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
-        self._measurement_publisher = self.create_publisher(Measurement, "~/measurements", EVENTS)
-        self._inputs = [
-            self.create_subscription(PlanMessage, chosen.plan_topic, self._on_plan, LATCHED),
-            self.create_subscription(JointState, "joint_states", self._on_joints, SENSOR_IN),
-        ]
+        if not chosen.store_folder:
+            text = "the campaign is in memory only and lost with the node: set store_folder to keep it"
+            self.get_logger().warning(text)
+        self._output = IdentifierOutput(self)
+        self.undo_with(self._leave_campaign)
+        self._begin_with_stored()
+        self.create_subscription(PlanMessage, chosen.plan_topic, self._on_plan, LATCHED)
+        if chosen.use_robot_description:
+            self.create_subscription(String, TOPIC, self._on_description, LATCHED)
+        for name in ("reset", "undo", "save", "report"):
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
+        self.create_service(UndoMeasurement, "~/undo_measurement", self._on_undo)
+
+    def activate(self) -> None:
+        """Hear the streams."""
+        chosen = self.settings.value
+        joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
+        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
+        self._hear(0, JointState, JOINTS, self._on_joints)
         for k, topic in enumerate(chosen.tracker_topics):
-            hear = partial(self._on_point, k)
-            self._inputs.append(self.create_subscription(PointStamped, topic, hear, SENSOR_IN))
-        actions = {"reset": self._reset, "undo": self._undo, "save": self._save}
-        self._offers = [
-            self.create_service(Trigger, f"~/{name}", partial(self._serve, action))
-            for name, action in actions.items()
-        ]
-        self._publish_estimate()
-        self.get_logger().info(f"ready to identify {robot.name}")
+            self._hear(1 + k, PointStamped, topic, partial(self._on_point, k))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
+        self.create_timer(chosen.diagnostics_period, self._tick, clock=steady)
+        self._update()
+        ready = self._waiting if self._campaign is None else f"ready to identify {self._campaign.robot.name}"
+        self.get_logger().info(ready)
+
+    def _hear(self, stream: int, kind: type, topic: str, callback: Callable[..., None]) -> None:
+        events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, stream))
+        self.create_subscription(kind, topic, callback, STREAM_IN, event_callbacks=events)
+
+    # ── which robot, which campaign ──────────────────────────────────────────────────────────────────
+
+    def _begin_with_stored(self) -> None:
+        try:
+            model = first_model(self.settings.value)
+        except StoreError:
+            model = first_model(replace(self.settings.value, store_folder=""))
+        if model is not None:
+            self._enter_campaign(model)
+
+    def _enter_campaign(self, model: IdentifiedModel) -> None:
+        """Go on with the campaign in the store, or begin one.
+
+        Raises:
+            CalibPlannerError: The store belongs to another robot, or cannot be used at all.
+        """
+        chosen = self.settings.value
+        try:
+            store = open_store(chosen.store_folder, model.stored, asdict(chosen), __version__)
+        except StoreError as error:
+            self.get_logger().error(f"nothing is accepted until the store can be opened: {error}")
+            store = UnavailableStore(model.stored, error)
+        self._model, self._campaign = model, Campaign(model.robot, model.follow, store)
+        if self._intake is not None:
+            self._intake.use(model.robot.joint_names)
+        if self._campaign.kept:
+            text = f"campaign of plan {self._campaign.plan_id[:40]!r} goes on"
+            self.get_logger().info(f"{text}: {len(self._campaign.kept)} measurements are in {store.path}")
+
+    def _leave_campaign(self) -> None:
+        if self._campaign is not None:
+            self._campaign.store.close()
+        self._campaign = self._model = self._intake = None
+
+    def _on_description(self, message: String) -> None:
+        model, campaign = self._model, self._campaign
+        if model is not None and message.data == model.urdf:
+            return
+        try:
+            if campaign is not None and not campaign.store.empty:
+                got, advice = "another one", "choose another store_folder, or clean up and configure"
+                raise InputError(TOPIC, got, f"the robot that was measured, {campaign.nominal.name}", advice)
+            heard = heard_model(message.data, self.settings.value)
+            self._replace_campaign(heard)
+        except CalibPlannerError as error:
+            self.get_logger().error(f"{TOPIC} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
+            self._waiting = f"{TOPIC} refused: {str(error)[:800]}"
+            return
+        self.get_logger().info(f"{TOPIC}: {heard.robot.name}, joints {', '.join(heard.robot.joint_names)}")
+
+    def _replace_campaign(self, model: IdentifiedModel) -> None:
+        """Enter a campaign of another robot, or of the same one with a store that may be there again."""
+        before, plan = self._campaign, self._plan
+        if before is not None:
+            before.store.close()
+        self._campaign = None
+        self._enter_campaign(model)
+        if plan is not None:
+            self._begin(plan)
+        self._update()
+
+    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
+
+    def _on_plan(self, message: PlanMessage) -> None:
+        try:
+            self._plan = plan_from_message(message)
+        except CalibPlannerError as error:
+            self._refuse_plan(message.plan_id, error)
+            return
+        self._begin(self._plan)
+
+    def _begin(self, received: ReceivedPlan) -> None:
+        campaign, chosen = self._campaign, self.settings.value
+        if campaign is None:
+            return
+        before = len(campaign.kept)
+        try:
+            keep = chosen.keep_measurements
+            if not campaign.begin(received.plan_id, received.plan, chosen.plan_tolerance, keep=keep):
+                return
+        except CalibPlannerError as error:
+            self._refuse_plan(received.plan_id, error)
+            return
+        name = f"plan {received.plan_id[:40]!r}"
+        text = f"{name}: {received.plan.measurements} measurements, {len(campaign.kept)} of them there"
+        self.get_logger().info(f"{text}; {before} were there of the plan before" if before else text)
+        self._update()
+
+    def _refuse_plan(self, plan_id: str, error: CalibPlannerError) -> None:
+        self.get_logger().error(f"plan {plan_id[:40]!r} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
+
+    def _on_joints(self, message: JointState) -> None:
+        if self._intake is None:
+            return
+        try:
+            results = self._intake.joints(message)
+        except InputError as error:
+            self.get_logger().warning(f"{JOINTS}: {str(error)[:1000]}", throttle_duration_sec=5.0)
+            return
+        if results:
+            self._handle(results)
+
+    def _on_point(self, target: int, message: PointStamped) -> None:
+        if self._intake is not None and (results := self._intake.point(target, message)):
+            self._handle(results)
+
+    def _on_lost(self, stream: int, event: object) -> None:
+        if self._intake is not None:
+            self._intake.watches[stream].lost += getattr(event, "total_count_change", 0)
+
+    # ── what goes out ────────────────────────────────────────────────────────────────────────────────
 
     @property
     def _how(self) -> Matching:
         s = self.settings.value
         return Matching(s.plan_tolerance, s.accept_unplanned, s.sigma, s.repeatability, s.most_measurements)
 
-    def _follow(self, plan: Plan) -> Robot:
-        chosen = self.settings.value
-        return _robot(chosen, chosen.parameters or ",".join(plan.parameters))
-
-    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
-
-    def _on_plan(self, message: PlanMessage) -> None:
-        dropped = len(self._campaign.accepted)
-        try:
-            received = plan_from_message(message)
-            if not self._campaign.begin(received.plan_id, received.plan):
-                return
-        except CalibPlannerError as error:
-            self.get_logger().error(f"plan {message.plan_id[:40]!r} refused: {error}")
-            return
-        if dropped:
-            self.get_logger().warning(f"new plan: {dropped} measurements of the previous one dropped")
-        self.get_logger().info(f"plan {message.plan_id[:40]!r}: {received.plan.measurements} measurements")
-        self._publish_estimate()
-
-    def _on_joints(self, message: JointState) -> None:
-        try:
-            joints = joints_from_message(message, self._campaign.nominal.joint_names)
-        except InputError as error:
-            self.get_logger().warning(f"joint_states: {error}", throttle_duration_sec=5.0)
-            return
-        self._handle(self._detector.add_joints(nanoseconds(message.header.stamp), joints))
-
-    def _on_point(self, target: int, message: PointStamped) -> None:
-        self._frame = message.header.frame_id or self._frame
-        stamp = nanoseconds(message.header.stamp)
-        self._handle(self._detector.add_point(target, stamp, point_from_message(message)))
-
-    # ── what goes out ────────────────────────────────────────────────────────────────────────────────
-
     def _handle(self, results: list[Standstill | Rejection]) -> None:
+        campaign, intake = self._campaign, self._intake
+        if campaign is None or intake is None:
+            return
         for found in results:
             if isinstance(found, Rejection):
-                self._campaign.rejected += 1
-                self._publish_measurement(found, found.reason.value, found.message)
+                self._output.decision(campaign, campaign.refuse(found, intake.frame))
                 continue
-            decision = self._campaign.take(found, self._how)
-            self._publish_decision(decision)
-            if decision.status == "accepted":
-                self._newest = found.stop
-                self._publish_estimate()
+            text = intake.offset_text(self.settings.value.clock_offset)
+            decision = campaign.take(found, self._how, intake.frame, ("clock_offset", text) if text else None)
+            self._output.decision(campaign, decision)
+            if decision.status == ACCEPTED:
+                self._update()
 
-    def _publish_decision(self, decision: Decision) -> None:
-        self._publish_measurement(
-            decision.found, decision.status, decision.reason, decision.index, decision.repetition
-        )
-
-    def _publish_measurement(
-        self,
-        found: Standstill | Rejection,
-        status: str,
-        reason: str,
-        index: int | None = None,
-        repetition: int = 0,
-    ) -> None:
-        message = measurement_message(
-            found,
-            self._campaign.nominal.joint_names,
-            self._frame,
-            status=status,
-            reason=reason,
-            plan_id=self._campaign.plan_id if index is not None else "",
-            index=index,
-            repetition=repetition,
-        )
-        self._measurement_publisher.publish(message)
-        self.get_logger().info(f"configuration {index}: {status} {reason}".rstrip())
-
-    def _publish_estimate(self) -> None:
+    def _update(self) -> None:
+        """Identify anew, publish it, and tell which measurements are seen otherwise now."""
         campaign = self._campaign
-        others = {
-            "plan_id": campaign.plan_id,
-            "configurations": len(campaign.done()),
-            "rejected": campaign.rejected,
-            "complete": campaign.complete,
-        }
+        if campaign is None:
+            return
+        found = campaign.estimate(self._how)
+        changed = campaign.judge()
+        self._output.estimate(campaign, found)
+        for decision in changed:
+            self._output.decision(campaign, decision)
+        self._output.description("" if self._model is None else self._model.urdf, found)
+
+    def _tick(self) -> None:
+        """Say how it goes; look whether a store in trouble is well again."""
+        campaign, intake, chosen = self._campaign, self._intake, self.settings.value
+        if campaign is not None and isinstance(campaign.store, UnavailableStore):
+            self._reopen()
+        elif campaign is not None and campaign.store.trouble and campaign.store.probe():
+            self.get_logger().info("the store can be written again")
+        if intake is not None:
+            now, seconds = self.get_clock().now().nanoseconds, chosen.diagnostics_period
+            health = intake.health(now, seconds)
+            name = self.get_fully_qualified_name().strip("/")
+            message = diagnostics(name, now, health, chosen.clock_offset, self._campaign, self._waiting)
+            self._output.diagnostics(message)
+
+    def _reopen(self) -> None:
+        """Go on with the campaign of a store that could not be opened, if it can be now."""
+        chosen = self.settings.value
         try:
-            found = campaign.estimate(self._how)
-        except (CalibPlannerError, ArithmeticError, ValueError) as error:
-            self.get_logger().error(f"identification failed: {error}")
-            found = TooFew(0, str(error))
-        if isinstance(found, TooFew):
-            message = CalibrationEstimate(
-                robot=campaign.robot.name,
-                measurements=len(campaign.accepted),
-                status=ESTIMATE_STATUS["too_few" if found.missing else "error"],
-                message=found.message,
-                **others,
-            )
-        else:
-            message = estimate_to_message(found, **others)
-        message.header.stamp = stamp_message(self._newest)
-        self._estimate_publisher.publish(message)
+            model = first_model(chosen) or self._model
+            if model is None:
+                return
+            open_store(chosen.store_folder, model.stored, asdict(chosen), __version__).close()
+        except StoreError:
+            return
+        self.get_logger().info("the store can be opened now")
+        self._replace_campaign(model)
 
     # ── services ─────────────────────────────────────────────────────────────────────────────────────
 
-    def _serve(self, action: object, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _serve(
+        self, action: Callable[[Campaign], str], _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         try:
-            response.message, response.success = action(), True  # type: ignore[operator]
-        except (CalibPlannerError, OSError) as error:
-            response.message, response.success = str(error), False
+            response.message, response.success = action(self._working()), True
+        except CalibPlannerError as error:
+            response.message, response.success = str(error)[:1000], False
         return response
 
-    def _reset(self) -> str:
-        count = self._campaign.reset()
-        self._publish_estimate()
-        return f"{count} measurements forgotten"
+    def _working(self) -> Campaign:
+        """The campaign, if there is one and the node is active."""
+        if not self.is_active:
+            raise InputError("node", self.state, "active", "activate it")
+        if self._campaign is None:
+            raise InputError("robot", "none", "a robot", self._waiting)
+        return self._campaign
 
-    def _undo(self) -> str:
-        withdrawn = self._campaign.undo()
-        if withdrawn is None:
-            raise InputError("undo", "no measurement", "a measurement to withdraw", "measure first")
-        self._publish_decision(withdrawn)
-        self._publish_estimate()
-        return f"measurement {withdrawn.repetition} of configuration {withdrawn.index} withdrawn"
+    def _reset(self, campaign: Campaign) -> str:
+        count = campaign.reset()
+        self._update()
+        return f"{count} measurements left behind; they stay in the store"
 
-    def _save(self) -> str:
-        paths = saving.save(self.settings.value.save_folder, self._campaign, self._how)
-        return "saved " + ", ".join(map(str, paths))
+    def _undo(self, campaign: Campaign) -> str:
+        return self._withdraw(campaign, 0)[1]
 
+    def _withdraw(self, campaign: Campaign, number: int) -> tuple[int, str]:
+        undone = campaign.undo(number)
+        if undone is None:
+            got = f"no measurement {number}" if number else "no measurement"
+            raise InputError("undo", got, "a measurement in use", "see the ids on ~/measurements")
+        self._output.decision(campaign, undone)
+        self._update()
+        return undone.number, f"measurement {undone.repetition} of configuration {undone.index} withdrawn"
 
-def _robot(settings: IdentifierParameters, parameters: str) -> Robot:
-    return load_shipped(settings.robot, parameters, settings.unknown, len(settings.tracker_topics))
+    def _on_undo(
+        self, request: UndoMeasurement.Request, response: UndoMeasurement.Response
+    ) -> UndoMeasurement.Response:
+        kind = UndoMeasurement.Response
+        try:
+            campaign = self._working()
+        except InputError as error:
+            response.status, response.message = kind.NOT_ACTIVE, str(error)
+            return response
+        try:
+            response.id, response.message = self._withdraw(campaign, request.id)
+            response.status = kind.SUCCESS
+        except StoreError as error:
+            response.status, response.message = kind.NOT_STORED, str(error)[:1000]
+        except InputError as error:
+            response.status, response.message = kind.UNKNOWN_ID, str(error)[:1000]
+        return response
+
+    @property
+    def _folder(self) -> str:
+        return self.settings.value.save_folder or self.settings.value.store_folder
+
+    def _save(self, campaign: Campaign) -> str:
+        urdf = "" if self._model is None else self._model.urdf
+        return "saved " + ", ".join(map(str, saving.save(self._folder, campaign, self._how, urdf)))
+
+    def _report(self, campaign: Campaign) -> str:
+        return f"report written to {saving.report(self._folder, campaign, self._how)}"
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -27,6 +27,9 @@ SENSOR_OUT = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 SENSOR_IN = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Streams that we hear: best effort matches every publisher, reliable or not."""
 
+STREAM_IN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The same where none may be missed: five seconds at 1 kHz."""
+
 DEEPEST = 100_000
 """Largest depth of a queue that an override may ask for."""
 

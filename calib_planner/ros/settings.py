@@ -70,28 +70,58 @@ class PlannerParameters(LifecycleParameters):
 
 
 @dataclass(frozen=True)
-class IdentifierParameters:
+class IdentifierParameters(LifecycleParameters):
     """Parameters of ``calibration_identifier``; the standstill's are those of ``StandstillSettings``."""
 
-    robot: str = parameter("kuka_kr270", ROBOT, read_only=True)
-    parameters: str = parameter("", LEVEL + "; empty = those of the plan", read_only=True)
-    unknown: str = parameter("", "what else is unknown: base, tool or base,tool", read_only=True)
+    robot: str = parameter("kuka_kr270", ROBOT + "; empty = only robot_description", at_configure=True)
+    use_robot_description: bool = parameter(
+        True, "a URDF heard on robot_description replaces robot, until something is accepted", at_configure=True
+    )
+    base_link: str = parameter(
+        "", "robot_description: first link of the chain; empty = the root", at_configure=True
+    )
+    tip_link: str = parameter("", "robot_description: last link; empty = the only tip", at_configure=True)
+    parameters: str = parameter("", LEVEL + "; empty = those of the plan", at_configure=True)
+    unknown: str = parameter("", "what else is unknown: base, tool or base,tool", at_configure=True)
     sigma: float = parameter(
         3e-5, "noise of one coordinate of one tracker point; 0 = from their scatter", unit="m", low=0, high=1
     )
     repeatability: float = parameter(
         0.0, "noise that averaging does not reduce (robot, reflector)", unit="m", low=0.0, high=1.0
     )
-    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", read_only=True)
-    plan_topic: str = parameter("calibration_planner/current_plan", "where the plan comes from", read_only=True)
+    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), "one topic per target", at_configure=True)
+    plan_topic: str = parameter(
+        "calibration_planner/current_plan", "where the plan comes from", at_configure=True
+    )
     plan_tolerance: float = parameter(
         0.01, "largest joint difference to a planned configuration", unit="rad or m", low=1e-6, high=1.0
     )
     accept_unplanned: bool = parameter(False, "use standstills that are in no plan")
+    keep_measurements: bool = parameter(False, "a new plan goes on with what was measured for the one before")
     most_measurements: int = parameter(5000, "measurements kept at most", low=1, high=1000000)
-    save_folder: str = parameter("", "folder for ~/save; empty = saving is off", read_only=True)
+    store_folder: str = parameter(
+        "",
+        "folder of the campaign: accepted is what is on its disk, and a restart goes on there; "
+        "empty = in memory only, lost with the node",
+        at_configure=True,
+    )
+    save_folder: str = parameter(
+        "",
+        "folder for ~/save and ~/report; empty = store_folder; without either saving is off",
+        at_configure=True,
+    )
+    clock_offset: float = parameter(
+        0.1,
+        "largest offset of the clocks of joints and points, by when both stop and start",
+        unit="s",
+        low=1e-3,
+        high=60.0,
+    )
+    diagnostics_period: float = parameter(
+        1.0, "time between two messages on /diagnostics", unit="s", low=0.05, high=3600.0, at_configure=True
+    )
     joint_tolerance: float = parameter(
-        1e-4, "standstill: largest range of a joint", unit="rad or m", low=1e-9, high=1.0, read_only=True
+        1e-4, "standstill: largest range of a joint", unit="rad or m", low=1e-9, high=1.0, at_configure=True
     )
     point_tolerance: float = parameter(
         3e-4,
@@ -99,26 +129,28 @@ class IdentifierParameters:
         unit="m",
         low=1e-7,
         high=1.0,
-        read_only=True,
+        at_configure=True,
     )
     settle: float = parameter(
-        0.1, "standstill: left out after the joints rest", unit="s", low=0.0, high=60.0, read_only=True
+        0.1, "standstill: left out after the joints rest", unit="s", low=0.0, high=60.0, at_configure=True
     )
     duration: float = parameter(
-        0.4, "standstill: shortest interval averaged", unit="s", low=0.01, high=600.0, read_only=True
+        0.4, "standstill: shortest interval averaged", unit="s", low=0.01, high=600.0, at_configure=True
     )
-    samples: int = parameter(20, "standstill: points of every target wanted", low=1, high=20000, read_only=True)
+    samples: int = parameter(
+        20, "standstill: points of every target wanted", low=1, high=20000, at_configure=True
+    )
     minimum_samples: int = parameter(
-        5, "standstill: points of a target needed to use it", low=1, high=20000, read_only=True
+        5, "standstill: points of a target needed to use it", low=1, high=20000, at_configure=True
     )
     patience: float = parameter(
-        2.0, "standstill: after this take what there is", unit="s", low=0.01, high=600.0, read_only=True
+        2.0, "standstill: after this take what there is", unit="s", low=0.01, high=600.0, at_configure=True
     )
     gap: float = parameter(
-        0.25, "standstill: longest pause within a stream", unit="s", low=1e-3, high=60.0, read_only=True
+        0.25, "standstill: longest pause within a stream", unit="s", low=1e-3, high=60.0, at_configure=True
     )
     window: float = parameter(
-        0.1, "standstill: how late a message may come", unit="s", low=0.0, high=60.0, read_only=True
+        0.1, "standstill: how late a message may come", unit="s", low=0.0, high=60.0, at_configure=True
     )
     skew: float = parameter(
         0.5,
@@ -126,7 +158,7 @@ class IdentifierParameters:
         unit="s",
         low=1e-3,
         high=60.0,
-        read_only=True,
+        at_configure=True,
     )
 
     def __post_init__(self) -> None:
@@ -208,11 +240,15 @@ def load_shipped(
     """
     if name not in shipped_robots():
         raise UnknownNameError("robot", name, shipped_robots())
-    robot = Robot.load(name)
-    words = unknown_words(unknown)
-    if targets is not None and targets != len(robot.targets):
-        if "tool" not in words:
-            expected = f"{len(robot.targets)} topics, as the robot has targets"
-            raise InputError("tracker_topics", f"{targets} topics", expected, "or set unknown to tool")
-        robot = robot.with_targets(np.zeros((targets, 3)))
-    return robot.with_parameters(parameters, words)
+    robot = with_topics(Robot.load(name), targets, unknown)
+    return robot.with_parameters(parameters, unknown_words(unknown))
+
+
+def with_topics(robot: Robot, topics: int | None, unknown: str) -> Robot:
+    """The robot with a target per topic; other than its own ones are at the tip, with ``tool`` unknown."""
+    if topics is None or topics == len(robot.targets):
+        return robot
+    if "tool" not in unknown_words(unknown):
+        expected = f"{len(robot.targets)} topics, as the robot has targets"
+        raise InputError("tracker_topics", f"{topics} topics", expected, "or set unknown to tool")
+    return robot.with_targets(np.zeros((topics, 3)))

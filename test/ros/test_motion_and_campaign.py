@@ -10,6 +10,7 @@ import pytest
 
 from calib_planner import Estimate, Plan, PlanProblem, Robot, plan
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
+from calib_planner.files.campaign_store import CampaignStore, StoredModel, open_store
 from calib_planner.instrument.standstill import Standstill, StandstillDetector
 from calib_planner.ros import saving
 from calib_planner.ros.campaign import Campaign, Matching, TooFew
@@ -52,9 +53,13 @@ def planned(robot: Robot) -> Plan:
 
 @pytest.fixture
 def campaign(robot: Robot, planned: Plan) -> Campaign:
-    made = Campaign(robot, lambda _: robot)
-    assert made.begin("p", planned)
+    made = Campaign(robot, lambda _: robot, memory(robot))
+    assert made.begin("p", planned, HOW.tolerance)
     return made
+
+
+def memory(robot: Robot) -> CampaignStore:
+    return open_store("", StoredModel(robot.name, robot.joint_names, len(robot.targets), ""), {}, "")
 
 
 def standstill(robot: Robot, q: np.ndarray, seed: int = 0) -> Standstill:
@@ -81,12 +86,12 @@ def test_far_from_the_plan(robot: Robot, planned: Plan, campaign: Campaign) -> N
     odd = standstill(robot, planned.configurations[0] + 0.02)
     decision = campaign.take(odd, HOW)
     assert decision.status == "not_in_plan" and "nearest planned configuration" in decision.reason
-    assert campaign.rejected == 1 and not campaign.accepted
+    assert campaign.rejections == {"not_in_plan": 1} and not campaign.accepted
     assert campaign.take(odd, replace(HOW, accept_unplanned=True)).status == "accepted"
 
 
 def test_without_a_plan(robot: Robot) -> None:
-    campaign = Campaign(robot, lambda _: robot)
+    campaign = Campaign(robot, lambda _: robot, memory(robot))
     decision = campaign.take(standstill(robot, np.zeros(2)), HOW)
     assert decision.status == "not_in_plan" and "no plan" in decision.reason
 
@@ -103,11 +108,11 @@ def test_undo_and_reset(robot: Robot, planned: Plan, campaign: Campaign) -> None
 def test_plans_for_others_are_refused(robot: Robot, planned: Plan, campaign: Campaign) -> None:
     campaign.take(standstill(robot, planned.configurations[0]), HOW)
     with pytest.raises(UnknownNameError):
-        campaign.begin("q", replace(planned, robot="other"))
+        campaign.begin("q", replace(planned, robot="other"), 0.01)
     with pytest.raises(InputError):
-        campaign.begin("q", replace(planned, joint_names=("q2", "q1")))
-    assert not campaign.begin("p", planned) and len(campaign.accepted) == 1
-    assert campaign.begin("q", planned) and not campaign.accepted
+        campaign.begin("q", replace(planned, joint_names=("q2", "q1")), 0.01)
+    assert not campaign.begin("p", planned, 0.01) and len(campaign.accepted) == 1
+    assert campaign.begin("q", planned, 0.01) and not campaign.accepted
 
 
 def test_memory_is_bounded(robot: Robot, planned: Plan, campaign: Campaign) -> None:

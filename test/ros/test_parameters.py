@@ -113,7 +113,6 @@ def test_good_values_are_followed(bench: Bench) -> None:
         (PlannerNode, {"unknown": "everything"}),
         (PlannerNode, {"sigma": "a"}),
         (IdentifierNode, {"minimum_samples": 30}),
-        (IdentifierNode, {"tracker_topics": ["a", "b"]}),
         (SimulatorNode, {"dropout_probability": 1.5}),
         (SimulatorNode, {"outlier_smallest": 0.2}),
         (SimulatorNode, {"instrument": "../laser_tracker"}),
@@ -152,6 +151,11 @@ def test_what_ros_declares_itself_is_allowed(bench: Bench) -> None:
     }
     node = bench.start(PlannerNode, robot="planar_2r", **others)
     assert node.is_active and node.get_parameter("use_sim_time").value
+
+
+def test_two_topics_need_an_unknown_tool_in_the_node_too(bench: Bench) -> None:
+    node = bench.start(IdentifierNode, tracker_topics=["a", "b"])
+    assert node.state == "unconfigured" and "set unknown to tool" in node.failure
 
 
 @pytest.mark.parametrize("values", [{"robot": "none"}, {"robot": "/etc/passwd"}, {"parameters": "none"}])
