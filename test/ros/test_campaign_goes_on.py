@@ -1,0 +1,356 @@
+"""The campaign below the node: outliers with a trail, restarts, kill -9, disks in trouble."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robots import plan_of, random_configurations
+
+from calib_planner import Estimate, Plan, Robot
+from calib_planner.errors import InputError, StoreError
+from calib_planner.files.campaign_store import CampaignStore, StoredModel, UnavailableStore, open_store
+from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
+from calib_planner.ros.campaign import MOST_REJECTIONS, NOT_STORED, Campaign, Matching, condition_of
+from calib_planner.simulation import random_deviations
+
+HOW = Matching(sigma=3e-5)
+ROBOT = Robot.load("planar_2r").with_parameters("lengths+offsets")
+TRUE = ROBOT.with_deviations(random_deviations(ROBOT, 3))
+LEVELS: dict[str, Callable[[Plan], Robot]] = {"same": lambda _: ROBOT}
+
+
+def planned(count: int = 12, seed: int = 0) -> Plan:
+    return plan_of(ROBOT, random_configurations(ROBOT, count, seed))
+
+
+PLAN = planned()
+
+
+def opened(folder: Path | str) -> CampaignStore:
+    return open_store(str(folder), StoredModel(ROBOT.name, ROBOT.joint_names, 1, "text"), {}, "")
+
+
+def begun(store: CampaignStore, plan: Plan | None = PLAN) -> Campaign:
+    made = Campaign(ROBOT, LEVELS["same"], store)
+    if plan is not None:
+        made.begin("p", plan, HOW.tolerance)
+    return made
+
+
+def seen(row: int, error: float = 0.0, attempt: int = 0, plan: Plan = PLAN) -> Standstill:
+    """What the tracker sees at a row of the plan, the same whenever it is asked; ``error`` [m] on top."""
+    q = plan.configurations[row]
+    rng = np.random.default_rng([row, attempt])
+    point = TRUE.positions(q)[0] + 3e-5 / np.sqrt(20) * rng.standard_normal((1, 3)) + [error, 0.0, 0.0]
+    start = (1000 + 2 * row) * NANO
+    return Standstill(start, start + NANO, q, point, np.full(1, 3e-5 / np.sqrt(20)), np.array([20]))
+
+
+def measure(campaign: Campaign, *founds: Standstill) -> list[str]:
+    """Statuses in the order told: of the standstills, and of what is seen otherwise after each."""
+    told = []
+    for found in founds:
+        decision = campaign.take(found, HOW, "laser")
+        told.append(decision.status)
+        if decision.status == "accepted":
+            campaign.estimate(HOW)
+            told += [f"{d.index} {d.status}" for d in campaign.judge()]
+    return told
+
+
+def assert_same_estimate(a: object, b: object) -> None:
+    assert isinstance(a, Estimate) and isinstance(b, Estimate)
+    for name in ("values", "deviations", "covariance", "residuals"):
+        assert np.allclose(getattr(a, name), getattr(b, name), rtol=0, atol=1e-12, equal_nan=True), name
+    assert a.rejected == b.rejected and a.verdict == b.verdict
+
+
+# ── outliers ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_an_outlier_is_told_kept_and_measured_again() -> None:
+    campaign = begun(opened(""))
+    assert set(measure(campaign, *(seen(k) for k in range(8)))) == {"accepted"}
+    assert measure(campaign, seen(8, 1e-3)) == ["accepted", "8 outlier"]
+    outlier = campaign.kept[-1]
+    assert "standard deviations" in outlier.reason and outlier.unused == (0,)
+    assert campaign.rejections == {"outlier": 1} and len(campaign.accepted) == 8
+    assert 8 in campaign.missing() and campaign.done()[8] == 0
+    assert measure(campaign, seen(8)) == ["accepted"] and campaign.kept[-1].repetition == 0
+    assert 8 not in campaign.missing()
+    trail = [t["status"] for t in campaign.store.history(outlier.number)]
+    assert trail == ["accepted", "outlier"]
+
+
+def test_the_estimate_does_not_see_the_outlier() -> None:
+    rows = range(10)
+    clean, dirty = begun(opened("")), begun(opened(""))
+    measure(clean, *(seen(k) for k in rows if k != 4))
+    measure(dirty, *(seen(k, 1e-2 if k == 4 else 0.0) for k in rows))
+    a, b = clean.newest, dirty.newest
+    assert isinstance(a, Estimate) and isinstance(b, Estimate)
+    assert np.allclose(a.values, b.values, rtol=0, atol=1e-9) and a.used == b.used == 9
+    assert condition_of(a) == pytest.approx(condition_of(b), rel=1e-3) and condition_of(a) > 1
+
+
+def test_a_point_that_was_an_outlier_is_accepted_again() -> None:
+    """A noise that was given too small makes outliers; with the right one they are none."""
+    campaign = begun(opened(""))
+    measure(campaign, *(seen(k) for k in range(8)), seen(8, 4e-4))
+    number = campaign.kept[-1].number
+    assert campaign.kept[-1].status == "outlier"
+    campaign.estimate(replace(HOW, sigma=2e-3))
+    (back,) = campaign.judge()
+    assert (back.number, back.status, back.reason, back.unused) == (number, "accepted", "", ())
+    assert [t["status"] for t in campaign.store.history(number)] == ["accepted", "outlier", "accepted"]
+    assert not campaign.judge()
+
+
+def test_undoing_an_outlier() -> None:
+    campaign = begun(opened(""))
+    measure(campaign, *(seen(k) for k in range(8)), seen(8, 1e-3))
+    undone = campaign.undo()
+    assert undone is not None and undone.status == "undone" and campaign.rejections == {"undone": 1}
+
+
+# ── one campaign after another ───────────────────────────────────────────────────────────────────────
+
+
+def test_a_restart_goes_on_where_it_was(tmp_path: Path) -> None:
+    store = opened(tmp_path)
+    campaign = begun(store)
+    measure(campaign, *(seen(k, 1e-3 if k == 6 else 0.0) for k in range(9)))
+    withdrawn = campaign.undo(campaign.kept[2].number)
+    assert withdrawn is not None and withdrawn.index == 2
+    campaign.take(replace(seen(0), joints=PLAN.configurations[0] + 0.5), HOW)
+    campaign.refuse(Rejection(1, 2, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3])))
+    before = campaign.estimate(HOW)
+    campaign.judge()
+    store.close()
+
+    store = opened(tmp_path)
+    again = begun(store, None)
+    assert (again.plan_id, again.missing(), again.rejections) == ("p", campaign.missing(), campaign.rejections)
+    told = [(d.number, d.status, d.reason, d.index, d.repetition, d.unused, d.frame) for d in campaign.kept]
+    assert told == [(d.number, d.status, d.reason, d.index, d.repetition, d.unused, d.frame) for d in again.kept]
+    assert_same_estimate(before, again.estimate(HOW))
+    assert not again.judge() and not again.begin("p", PLAN, 0.01)
+    store.close()
+
+
+def test_the_way_does_not_matter() -> None:
+    """The same measurements in the store, reached by detours: the same estimate, to the bit."""
+    straight, detour = begun(opened("")), begun(opened(""))
+    measure(straight, *(seen(k) for k in (0, 1, 2, 4, 6)))
+    measure(detour, *(seen(k, 5e-3 if k == 3 else 0.0) for k in (0, 1, 2, 3, 4, 5, 6)))
+    for row in (3, 5):
+        detour.undo(next(d.number for d in detour.kept if d.index == row))
+    a, b = straight.estimate(HOW), detour.estimate(HOW)
+    assert isinstance(a, Estimate) and isinstance(b, Estimate) and np.array_equal(a.values, b.values)
+
+
+def test_a_plan_that_comes_back() -> None:
+    campaign = begun(opened(""))
+    measure(campaign, seen(0), seen(1))
+    assert campaign.begin("other", planned(4), 0.01) and not campaign.kept
+    assert campaign.begin("p", PLAN, 0.01) and [d.index for d in campaign.kept] == [0, 1]
+    with pytest.raises(InputError, match="plan_id"):
+        campaign.begin("p", planned(4), 0.01)
+    assert campaign.plan_id == "p" and len(campaign.kept) == 2
+
+
+def test_a_new_plan_can_go_on_with_the_measurements() -> None:
+    campaign = begun(opened(""))
+    measure(campaign, *(seen(k) for k in range(6)))
+    before = campaign.newest
+    rest = replace(PLAN, configurations=PLAN.configurations[[3, 4, 8]], repetitions=np.ones(3, int))
+    assert campaign.begin("rest", rest, 0.01, keep=True)
+    assert [d.index for d in campaign.kept] == [None, None, None, 0, 1, None] and campaign.missing() == [2]
+    assert_same_estimate(before, campaign.estimate(HOW))
+    again = begun(campaign.store, None)
+    assert [d.index for d in again.kept] == [d.index for d in campaign.kept]
+
+
+def test_reset_leaves_the_old_campaign_in_the_store() -> None:
+    campaign = begun(opened(""))
+    measure(campaign, seen(0), seen(1))
+    number = campaign.kept[0].number
+    assert campaign.reset() == 2 and not campaign.kept and campaign.missing() == list(range(12))
+    assert len(campaign.store.history(number)) == 1
+    measure(campaign, seen(0))
+    assert [d.index for d in begun(campaign.store, None).kept] == [0]
+
+
+def test_rejections_cannot_fill_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calib_planner.ros.campaign.MOST_REJECTIONS", 20)
+    assert MOST_REJECTIONS > 20
+    campaign = begun(opened(""))
+    wrong = Rejection(1, 2, Reason.MOVED, "moved", np.zeros(2), np.array([3]))
+    numbers = [campaign.refuse(wrong).number for _ in range(50)]
+    assert sum(n > 0 for n in numbers) == 20 and campaign.rejections == {"moved": 50}
+    assert measure(campaign, seen(0)) == ["accepted"]
+
+
+# ── disks in trouble ─────────────────────────────────────────────────────────────────────────────────
+
+
+def test_what_cannot_be_written_is_not_accepted() -> None:
+    campaign = begun(opened(""))
+    measure(campaign, *(seen(k) for k in range(8)))
+    before = campaign.newest
+    campaign.store._database.execute("PRAGMA query_only = ON")
+    decision = campaign.take(seen(8), HOW)
+    assert decision.status == NOT_STORED and decision.reason.startswith("not stored: ") and decision.number == 0
+    assert len(campaign.kept) == 8 and campaign.newest is before and campaign.store.trouble
+    with pytest.raises(StoreError):
+        campaign.undo()
+    with pytest.raises(StoreError):
+        campaign.reset()
+    assert len(campaign.kept) == 8 and campaign.begin("second", planned(4), 0.01)
+    assert campaign.take(seen(8, plan=PLAN), HOW).status == "not_in_plan"
+    campaign.store._database.execute("PRAGMA query_only = OFF")
+    assert measure(campaign, seen(0, plan=planned(4))) == ["accepted"] and not campaign.store.trouble
+    again = begun(campaign.store, None)
+    assert again.plan_id == "second" and len(again.kept) == 1
+
+
+def test_what_is_seen_otherwise_is_written_when_that_is_possible() -> None:
+    campaign = begun(opened(""))
+    measure(campaign, *(seen(k) for k in range(8)))
+    assert campaign.take(seen(8, 1e-3), HOW).status == "accepted"
+    campaign.store._database.execute("PRAGMA query_only = ON")
+    campaign.estimate(HOW)
+    (changed,) = campaign.judge()
+    assert changed.status == "outlier" and not campaign.judge()
+    campaign.store._database.execute("PRAGMA query_only = OFF")
+    assert not campaign.judge()
+    assert [t["status"] for t in campaign.store.history(changed.number)] == ["accepted", "outlier"]
+
+
+def test_a_store_that_cannot_be_opened_stops_acceptance_only() -> None:
+    store = UnavailableStore(StoredModel(ROBOT.name, ROBOT.joint_names, 1, ""), StoreError("/mnt", "read-only"))
+    campaign = begun(store)
+    assert campaign.plan_id == "p" and measure(campaign, seen(0)) == [NOT_STORED]
+    assert "read-only" in campaign.take(seen(0), HOW).reason
+
+
+# ── kill -9 ──────────────────────────────────────────────────────────────────────────────────────────
+
+CAMPAIGN = """
+    import sys
+    from test_campaign_goes_on import *
+    campaign = begun(opened(sys.argv[1]))
+    campaign.estimate(HOW); campaign.judge()
+    print("open", *sorted(d.number for d in campaign.kept), flush=True)
+    for attempt, row in schedule(campaign):
+        if attempt == "undo":
+            print("undone", campaign.undo(row).number, flush=True)
+            campaign.estimate(HOW); campaign.judge()
+            continue
+        for word in measure(campaign, seen(row, 2e-3 if row == 5 and attempt == 0 else 0.0, attempt)):
+            print(word, campaign.kept[-1].number, flush=True)
+    print("complete", flush=True)
+    sys.stdin.read()
+"""
+
+
+def schedule(campaign: Campaign) -> list[tuple[object, int]]:
+    """What is still to be done: rows 0 to 11, where 5 goes wrong first and 7 is withdrawn and measured again."""
+    done = {(d.index, d.found.start, tuple(d.found.points.ravel())) for d in everything(campaign)}  # type: ignore[union-attr]
+    steps: list[tuple[object, int]] = []
+    for row in range(12):
+        first = (row, seen(row).start, tuple(seen(row, 2e-3 if row == 5 else 0.0).points.ravel()))
+        if first not in done:
+            steps.append((0, row))
+    if steps:
+        return steps
+    seven = [d for d in campaign.kept if d.index == 7]
+    again = {(row, tuple(seen(row, 0.0, 1).points.ravel())) for row in (5, 7)}
+    for d in seven:
+        if tuple(d.standstill.points.ravel()) == tuple(seen(7).points.ravel()):
+            steps.append(("undo", d.number))
+    have = {(d.index, tuple(d.standstill.points.ravel())) for d in campaign.kept}
+    return steps + [(1, row) for row, points in sorted(again) if (row, points) not in have]
+
+
+def everything(campaign: Campaign) -> list[object]:
+    found = campaign.store.current()
+    assert found is not None
+    return [d for d in found.decisions if isinstance(d.found, Standstill)]
+
+
+def run_campaign(folder: Path) -> subprocess.Popen[str]:
+    here = Path(__file__)
+    paths = [str(here.parent), str(here.parents[1]), str(here.parents[2]), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(CAMPAIGN), str(folder)], text=True, env=environment, **pipes
+    )  # type: ignore[call-overload]
+
+
+def final(folder: Path) -> tuple[list[tuple[object, ...]], object]:
+    store = opened(folder)
+    campaign = begun(store)
+    estimate = campaign.estimate(HOW)
+    campaign.judge()
+    store.close()
+    return [(d.index, d.status, tuple(d.standstill.points.ravel())) for d in campaign.kept], estimate
+
+
+def finish(folder: Path) -> None:
+    """Run until there is nothing left to do."""
+    for _ in range(3):
+        store = opened(folder)
+        left = schedule(begun(store))
+        store.close()
+        if not left:
+            return
+        with run_campaign(folder) as process:
+            assert process.stdout is not None
+            while "complete" not in process.stdout.readline():
+                assert process.poll() is None
+            process.kill()
+    raise AssertionError("not finished")
+
+
+def test_kill_9_at_any_moment_costs_nothing_that_was_told(tmp_path: Path) -> None:
+    finish(tmp_path / "undisturbed")
+    wanted, estimate = final(tmp_path / "undisturbed")
+    assert [i for i, status, _ in wanted if status == "outlier"] == [5]
+    rng, folder = random.Random(3), tmp_path / "killed"
+    told: set[int] = set()
+    for _ in range(10):
+        with run_campaign(folder) as process:
+            assert process.stdout is not None
+            first = process.stdout.readline().split()
+            assert told <= {int(n) for n in first[1:]}, "told and lost"
+            told = {int(n) for n in first[1:]}
+            for _ in range(rng.randrange(4)):
+                note(process.stdout.readline(), told)
+            process.kill()
+            for line in process.stdout:
+                note(line, told)
+    finish(folder)
+    found, again = final(folder)
+    assert found == wanted
+    assert_same_estimate(estimate, again)
+
+
+def note(line: str, told: set[int]) -> None:
+    words = line.split()
+    if not line.endswith("\n") or words[0] in ("complete", "open"):
+        return
+    if words[0] == "accepted":
+        told.add(int(words[-1]))
+    elif words[0] == "undone":
+        told.discard(int(words[-1]))
