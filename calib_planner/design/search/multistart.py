@@ -34,6 +34,9 @@ CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
 FINALISTS = 3
 """Plans of each chunk that are polished to the end."""
+BATCH = 4_000_000
+"""Numbers in the inverse Hessians of descents side by side: beyond that, moving them through memory takes longer
+than the work on them, and a large plan would not notice for seconds that it was cancelled."""
 EDGE_ROUNDS = 4
 """Turns of random steps and descent that a constrained plan gets at most."""
 
@@ -182,15 +185,26 @@ def _descend_from(
     tolerance: float,
 ) -> Descent:
     low, high = problem.model.robot.joint_limits.T
-    return descend(
-        plan_objective(problem, size),
-        rows.reshape(len(rows), -1),
-        np.tile(low, size),
-        np.tile(high, size),
-        iterations=iterations,
-        tolerance=tolerance,
-        stop=stop,
-        mend=_mend(problem.feasibility, size),
+    flat = rows.reshape(len(rows), -1)
+    beside = max(BATCH // flat.shape[1] ** 2, 1)
+    ended = [
+        descend(
+            plan_objective(problem, size),
+            flat[first : first + beside],
+            np.tile(low, size),
+            np.tile(high, size),
+            iterations=iterations,
+            tolerance=tolerance,
+            stop=stop,
+            mend=_mend(problem.feasibility, size),
+        )
+        for first in range(0, len(flat), beside)
+    ]
+    return Descent(
+        np.concatenate([part.x for part in ended]),
+        np.concatenate([part.value for part in ended]),
+        max(part.iterations for part in ended),
+        sum(part.evaluations for part in ended),
     )
 
 
