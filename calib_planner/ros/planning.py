@@ -27,6 +27,8 @@ from calib_planner.ros.model_source import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, unknown_words
 
 MOST_PARAMETERS = 1000
+MOST_COORDINATES = 3000
+"""Configurations times joints: the search keeps a square matrix of them (100 MB with its copies)."""
 FIELD_OF = {"weights": "test_pose_weights"}
 """The request's word for a field of ``PlanProblem``, where they differ."""
 
@@ -91,6 +93,9 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
     if size > settings.most_configurations:
         advice = "raise the node's parameter most_configurations if you mean it"
         raise InputError("configurations", size, f"at most {settings.most_configurations}", advice)
+    if size * len(robot.joint_names) > MOST_COORDINATES:
+        most = f"at most {MOST_COORDINATES // len(robot.joint_names)} for {len(robot.joint_names)} joints"
+        raise InputError("configurations", size, most)
     limit = float(request.time_limit)
     if not 0 <= limit <= 86400.0:
         raise InputError("time_limit", limit, "0 (the node's default) to 86400 s")

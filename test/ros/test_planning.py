@@ -64,6 +64,13 @@ def identifier(case: Any) -> str:
     return str(case)[:40]
 
 
+def test_a_long_chain_and_many_configurations_are_refused_before_memory_is() -> None:
+    settings = replace(SETTINGS, most_configurations=10_000)
+    request = PlanCalibration.Request(test_poses=[0.1] * 60, configurations=51)
+    found = answer(request, settings, described_model(urdf(60)))
+    assert (found.status, found.field) == ("INVALID_REQUEST", "configurations") and "at most 50" in found.message
+
+
 @pytest.mark.parametrize(("change", "status", "field"), BAD, ids=identifier)
 def test_bad_requests(change: dict[str, Any], status: str, field: str) -> None:
     request = PlanCalibration.Request(**({"test_poses": POSE} | change))
