@@ -133,7 +133,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
 
     def _on_description(self, message: String) -> None:
         model, campaign = self._model, self._campaign
-        if model is not None and message.data == model.urdf:
+        if model is not None and model.urdf and message.data == model.urdf:
             return
         try:
             if campaign is not None and not campaign.store.empty:

@@ -9,14 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 from bench import Bench
+from builtin_interfaces.msg import Time
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
+from calib_planner_msgs.srv import UndoMeasurement
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from rclpy.lifecycle import TransitionCallbackReturn
+from robots import plan_of, random_configurations
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner import Plan, PlanProblem, Robot, plan
+from calib_planner.files.campaign_schema import FILE
 from calib_planner.instrument.standstill import NANO
+from calib_planner.robot.urdf import parse_urdf
 from calib_planner.ros.conversions import plan_to_message, point_message, stamp_message
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_OUT
@@ -43,7 +51,7 @@ def planned(robot: Robot) -> Plan:
 class Shift:
     """Publishes standstills, faster than real time: only stamps count."""
 
-    def __init__(self, bench: Bench, robot: Robot, **parameters: Any) -> None:
+    def __init__(self, bench: Bench, robot: Robot, /, estimates: int = 1, **parameters: Any) -> None:
         self.bench, self.robot, self.stamp = bench, robot, 1_000 * NANO
         self.truth = random_deviations(robot, 4)
         self.true_robot = robot.with_deviations(self.truth)
@@ -57,14 +65,19 @@ class Shift:
         self.node = bench.start(IdentifierNode, **({"robot": "planar_2r"} | RELIABLE | parameters))
         self.sent = 0
         bench.wait(lambda: self.joints.get_subscription_count() and self.points.get_subscription_count())
-        bench.wait(lambda: self.estimates)
+        bench.wait(lambda: len(self.estimates) >= estimates)
 
     def announce(self, planned: Plan, plan_id: str = "p") -> None:
         self.plans.publish(plan_to_message(planned, plan_id, 0, "base"))
         self.bench.wait(lambda: self.estimates[-1].plan_id == plan_id)
 
-    def rest(self, q: Any, seconds: float = 0.8, shake: float = 0.0) -> Measurement:
-        """Stand still at ``q`` with ``shake`` [m] on the point; returns what became of it."""
+    def rest(
+        self, q: Any, seconds: float = 0.8, shake: float = 0.0, error: float = 0.0, offset: float = 0.0
+    ) -> Measurement:
+        """Stand still at ``q`` with ``shake`` and ``error`` [m] on the point and its stamp ``offset`` [s] ahead.
+
+        Returns what becomes of it.
+        """
         count = len(self.measurements)
         self.stamp += NANO  # the way there: a gap, which ends a standstill
         for i in range(int(seconds * 100)):
@@ -74,11 +87,11 @@ class Shift:
             self.send(self.joints, state)
             if i % 2:
                 xyz = self.true_robot.positions(q)[0, 0] + 3e-5 * self.rng.standard_normal(3)
-                xyz[0] += shake * np.sin(i)
-                self.send(self.points, point_message(xyz, stamp, "laser"))
+                xyz[0] += shake * np.sin(i) + error
+                self.send(self.points, point_message(xyz, stamp + round(offset * NANO), "laser"))
         self.stamp += int(seconds * NANO)
         self.bench.wait(lambda: self.sent == self.fed)
-        self.tick(q)
+        self.tick(q, offset)
         self.bench.wait(lambda: len(self.measurements) > count)
         return self.measurements[-1]
 
@@ -93,14 +106,14 @@ class Shift:
         self.sent += 1
         self.bench.wait(lambda: self.sent - self.fed <= ahead)
 
-    def tick(self, q: Any) -> None:
+    def tick(self, q: Any, offset: float = 0.0) -> None:
         """Let time go on: one message of each stream after a gap, elsewhere."""
         for k in (1, 2):
             stamp = self.stamp + k * NANO // 2
             state = JointState(name=["q1", "q2"], position=[float(q[0]) + 0.5, float(q[1])])
             state.header.stamp = stamp_message(stamp)
             self.send(self.joints, state, 0)
-            self.send(self.points, point_message(np.zeros(3), stamp, "laser"), 0)
+            self.send(self.points, point_message(np.zeros(3), stamp + round(offset * NANO), "laser"), 0)
         self.stamp += NANO
 
     def service(self, name: str) -> Trigger.Response:
@@ -190,8 +203,223 @@ def test_nonsense_on_every_topic_does_no_harm(shift: Shift, planned: Plan) -> No
     assert shift.rest(planned.configurations[1]).status == Measurement.ACCEPTED
 
 
-def test_a_new_plan_begins_anew(shift: Shift, planned: Plan) -> None:
+def test_a_new_plan_begins_anew_and_the_old_one_comes_back(shift: Shift, planned: Plan) -> None:
     shift.announce(planned)
     assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
     shift.announce(planned, "second")
     assert shift.estimates[-1].measurements == 0
+    shift.announce(planned)
+    assert shift.estimates[-1].measurements == 1
+
+
+# ── what is wrong with measurements ──────────────────────────────────────────────────────────────────
+
+
+def spread(count: int) -> Plan:
+    robot = Robot.load("planar_2r").with_parameters("lengths+offsets")
+    return plan_of(robot, random_configurations(robot, count))
+
+
+def test_an_outlier_is_published_again_and_can_be_withdrawn(shift: Shift) -> None:
+    planned = spread(9)
+    shift.announce(planned)
+    for q in planned.configurations[:8]:
+        assert shift.rest(q).status == Measurement.ACCEPTED
+    shift.rest(planned.configurations[8], error=2e-3)
+    shift.bench.wait(lambda: shift.measurements[-1].status == Measurement.REJECTED_OUTLIER)
+    first, again = shift.measurements[-2:]
+    assert first.id == again.id > 0 and first.status == Measurement.ACCEPTED
+    assert "standard deviations" in again.reason and list(again.unused_targets) == [0]
+    shift.bench.wait(lambda: shift.estimates[-1].outliers == 1)
+    last = shift.estimates[-1]
+    assert last.rejected == 1 and last.configurations == 8 and not last.complete
+    assert last.verdict in ("PASS", "WARN", "FAIL") and last.condition >= 1.0
+
+    undo = UndoMeasurement.Request(id=again.id)
+    answer = shift.bench.call(UndoMeasurement, f"{NAME}/undo_measurement", undo, attempts=1)
+    assert (answer.status, answer.id) == (UndoMeasurement.Response.SUCCESS, again.id)
+    shift.bench.wait(lambda: shift.measurements[-1].status == Measurement.REJECTED_UNDONE)
+    answer = shift.bench.call(UndoMeasurement, f"{NAME}/undo_measurement", undo)
+    assert answer.status == UndoMeasurement.Response.UNKNOWN_ID and answer.message
+
+
+def test_clocks_that_differ_are_noticed_and_forgiven(shift: Shift) -> None:
+    planned = spread(20)
+    shift.announce(planned)
+    told = [shift.rest(q, 1.2, offset=0.3) for q in planned.configurations[:6]]
+    assert [m.status for m in told[-2:]] == [Measurement.REJECTED_CLOCK_OFFSET] * 2
+    assert told[0].status == Measurement.ACCEPTED and "ms from the joints" in told[-1].reason
+    told = [shift.rest(q, 1.2) for q in planned.configurations[6:14]]
+    assert told[-1].status == Measurement.ACCEPTED
+
+
+@pytest.mark.parametrize("stamp", [0, -5 * NANO])
+def test_messages_without_a_stamp_are_refused_with_a_reason(shift: Shift, planned: Plan, stamp: int) -> None:
+    shift.announce(planned)
+    state = JointState(name=["q1", "q2"], position=[0.0, 0.0])
+    state.header.stamp = Time(sec=stamp // NANO)
+    shift.send(shift.joints, state)
+    shift.bench.wait(lambda: "stamp" in shift.node._intake.watches[0].reason)
+    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
+
+
+# ── nothing lost ─────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_what_cannot_be_stored_is_not_accepted(shift: Shift, planned: Plan) -> None:
+    shift.announce(planned)
+    database = shift.node._campaign.store._database
+    database.execute("PRAGMA query_only = ON")
+    refused = shift.rest(planned.configurations[0])
+    assert refused.status == Measurement.REJECTED_NOT_STORED and refused.reason.startswith("not stored: ")
+    assert refused.id == 0 and not shift.service("reset").success
+    answer = shift.bench.call(UndoMeasurement, f"{NAME}/undo_measurement", UndoMeasurement.Request())
+    assert answer.status == UndoMeasurement.Response.UNKNOWN_ID
+    database.execute("PRAGMA query_only = OFF")
+    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
+
+
+def test_a_configured_again_node_goes_on(bench: Bench, robot: Robot, planned: Plan, tmp_path: Path) -> None:
+    shift = Shift(bench, robot, store_folder=str(tmp_path))
+    shift.announce(planned)
+    for q in planned.configurations:
+        assert shift.rest(q).status == Measurement.ACCEPTED
+    shift.bench.wait(lambda: shift.estimates[-1].complete)
+    before, count = shift.estimates[-1], len(shift.estimates)
+    assert shift.service("save").success and shift.service("report").success
+    names = {p.name for p in tmp_path.iterdir()}
+    assert {"estimate_p.yaml", "measurements_p.csv", "report_p.html"} <= names
+    for transition in ("deactivate", "cleanup", "configure", "activate"):
+        assert getattr(shift.node, f"trigger_{transition}")() == TransitionCallbackReturn.SUCCESS
+    bench.wait(lambda: len(shift.estimates) > count)
+    after = shift.estimates[-1]
+    assert after.complete and after.plan_id == "p"
+    assert np.allclose(after.value, before.value, rtol=0, atol=1e-12)
+
+
+def test_services_of_a_node_that_is_not_active_say_so(bench: Bench) -> None:
+    node = bench.start(IdentifierNode, robot="planar_2r", autostart=False)
+    node.trigger_configure()
+    for name in ("reset", "undo", "save", "report"):
+        answer = bench.call(Trigger, f"{NAME}/{name}", Trigger.Request())
+        assert not answer.success and "inactive" in answer.message
+    undo = bench.call(UndoMeasurement, f"{NAME}/undo_measurement", UndoMeasurement.Request())
+    assert undo.status == UndoMeasurement.Response.NOT_ACTIVE
+
+
+def test_a_store_of_another_robot_is_refused(bench: Bench, robot: Robot, planned: Plan, tmp_path: Path) -> None:
+    shift = Shift(bench, robot, store_folder=str(tmp_path))
+    shift.announce(planned)
+    shift.rest(planned.configurations[0])
+    shift.node.close()
+    before = (tmp_path / FILE).read_bytes()
+    other = bench.start(IdentifierNode, robot="kuka_kr270", store_folder=str(tmp_path))
+    assert other.state == "unconfigured" and "planar_2r" in other.failure
+    assert (tmp_path / FILE).read_bytes() == before
+
+
+def test_two_nodes_cannot_share_a_folder(bench: Bench, tmp_path: Path) -> None:
+    bench.start(IdentifierNode, robot="planar_2r", store_folder=str(tmp_path))
+    second = bench.start(IdentifierNode, robot="planar_2r", store_folder=str(tmp_path))
+    assert second.state == "unconfigured" and "another process uses" in second.failure
+
+
+def test_a_folder_that_cannot_be_opened_yet(bench: Bench, robot: Robot, planned: Plan, tmp_path: Path) -> None:
+    (tmp_path / "blocked").write_text("a file where the folder should be")
+    shift = Shift(bench, robot, store_folder=str(tmp_path / "blocked"), diagnostics_period=0.05)
+    shift.announce(planned)
+    assert shift.rest(planned.configurations[0]).status == Measurement.REJECTED_NOT_STORED
+    (tmp_path / "blocked").unlink()
+    bench.wait(lambda: (tmp_path / "blocked" / FILE).exists() and not shift.node._campaign.store.trouble)
+    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
+    assert shift.estimates[-1].plan_id == "p"
+
+
+# ── robot descriptions ───────────────────────────────────────────────────────────────────────────────
+
+ARM = """<robot name="arm"><link name="base"/><link name="a"/><link name="b"/><link name="c"/><link name="tip"/>
+<joint name="j1" type="revolute"><origin xyz="0 0 0.3"/><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+<joint name="j2" type="revolute"><origin xyz="0.1 0 0.2"/><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+<joint name="j3" type="revolute"><origin xyz="0.5 0 0"/><parent link="b"/><child link="c"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+<joint name="flange" type="fixed"><origin xyz="0.4 0 0.1"/><parent link="c"/><child link="tip"/></joint></robot>
+"""
+
+
+class ArmShift(Shift):
+    """The same with a robot out of a URDF, in its own joints."""
+
+    def rest(self, q: Any, **others: Any) -> Measurement:  # type: ignore[override]
+        count = len(self.measurements)
+        self.stamp += NANO
+        names = list(self.robot.joint_names)
+        point = self.true_robot.positions(q)[0, 0] + 1e-5 * self.rng.standard_normal(3)
+        for away in (0.0, 0.5):
+            for i in range(80 if not away else 2):
+                stamp = self.stamp + i * (10**7 if not away else NANO // 2)
+                state = JointState(name=names, position=(np.asarray(q) + away).tolist())
+                state.header.stamp = stamp_message(stamp)
+                self.send(self.joints, state, 0)
+                self.send(self.points, point_message(point, stamp, "laser"), 0)
+            self.stamp += 2 * NANO
+        self.bench.wait(lambda: len(self.measurements) > count)
+        return self.measurements[-1]
+
+
+def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
+    robot = parse_urdf(ARM, "arm").with_parameters("lengths+offsets")
+    descriptions = bench.client.create_publisher(String, "robot_description", LATCHED)
+    calibrated = bench.hear(String, f"{NAME}/robot_description", LATCHED)
+    shift = ArmShift(bench, robot, robot="", store_folder=str(tmp_path), estimates=0)
+    assert "robot_description" in shift.node._waiting
+    assert "robot_description" in shift.service("undo").message
+    descriptions.publish(String(data=ARM))
+    bench.wait(lambda: calibrated and shift.estimates)
+    assert calibrated[0].data == ARM
+    planned = plan_of(robot, random_configurations(robot, 12))
+    shift.announce(planned)
+    for q in planned.configurations:
+        assert shift.rest(q).status == Measurement.ACCEPTED
+    bench.wait(lambda: shift.estimates[-1].complete)
+    bench.wait(lambda: calibrated[-1].data != ARM)
+    published = parse_urdf(calibrated[-1].data, "calibrated")
+    estimate = shift.node._campaign.newest
+    q = random_configurations(robot, 5, 1)
+    assert np.allclose(published.positions(q), estimate.calibrated.positions(q), atol=1e-12)
+    assert shift.service("save").success
+    assert (tmp_path / "calibrated_p.urdf").read_text() == calibrated[-1].data
+
+    descriptions.publish(String(data=ARM.replace("0.5 0 0", "0.6 0 0")))
+    bench.wait(lambda: "refused" in shift.node._waiting)
+    assert shift.node._campaign.nominal.name == "arm" and len(shift.node._campaign.kept) == 12
+    shift.node.close()
+    again = bench.start(IdentifierNode, robot="", store_folder=str(tmp_path))
+    assert again._campaign.nominal.joint_names == robot.joint_names and len(again._campaign.kept) == 12
+
+
+@pytest.mark.parametrize("text", ["", "<robot", "<!DOCTYPE a [<!ENTITY b 'c'>]><robot/>", "x" * 5_000_000])
+def test_a_bad_description_changes_nothing(bench: Bench, robot: Robot, planned: Plan, text: str) -> None:
+    shift = Shift(bench, robot)
+    descriptions = bench.client.create_publisher(String, "robot_description", LATCHED)
+    descriptions.publish(String(data=text))
+    bench.wait(lambda: "refused" in shift.node._waiting)
+    shift.announce(planned)
+    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
+
+
+def test_two_targets(bench: Bench) -> None:
+    robot = Robot.load("planar_2r").with_targets(np.zeros((2, 3))).with_parameters("lengths+offsets", ["tool"])
+    bench.start(IdentifierNode, robot="planar_2r", unknown="tool", tracker_topics=["a", "b"])
+    assert len(robot.targets) == 2 and len(bench.nodes[0]._campaign.robot.targets) == 2
+    assert {w.name for w in bench.nodes[0]._intake.watches} == {"joint_states", "a", "b"}
+
+
+def test_simulated_time_that_stands_still_stops_nothing(bench: Bench, robot: Robot, planned: Plan) -> None:
+    told = bench.hear(DiagnosticArray, "/diagnostics", EVENTS)
+    shift = Shift(bench, robot, use_sim_time=True, diagnostics_period=0.05)
+    shift.announce(planned)
+    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
+    bench.wait(lambda: told)
+    assert told[-1].header.stamp.sec == 0
