@@ -22,8 +22,8 @@ INTRODUCTION = """\
 What the nodes offer and take with their default parameters, and every field of package `calib_planner_msgs` with
 its unit. Names are relative; `~` is the node's name. *Latched* (transient local): a late joiner gets the newest.
 Left out are parameter services, logging, and what
-[lifecycle nodes](https://design.ros2.org/articles/node_lifecycle.html) have. The quality of service of our topics can
-be overridden by parameters `qos_overrides.TOPIC.publisher.…`."""
+[lifecycle nodes](https://design.ros2.org/articles/node_lifecycle.html) have. The quality of service of our topics
+can be overridden by parameters `qos_overrides.TOPIC.publisher.…`."""
 
 LEFT_OUT = re.compile(
     r"rosout|parameter_events|transition_event|_state$|_states$|_transitions$|_graph$|"
