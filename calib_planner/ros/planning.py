@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib_planner._arrays import FloatArray
 from calib_planner.design.discrepancy import ModelDiscrepancy
 from calib_planner.design.feasibility import Constraint
@@ -27,6 +29,8 @@ from calib_planner.ros.model_source import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, unknown_words
 
 MOST_PARAMETERS = 1000
+SMALLEST_SIGMA = 1e-9
+"""As the node's parameter: far below any instrument, far above what overflows when squared."""
 MOST_COORDINATES = 3000
 """Configurations times joints: the search keeps a square matrix of them (100 MB with its copies)."""
 FIELD_OF = {"weights": "test_pose_weights"}
@@ -100,8 +104,8 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
     if not 0 <= limit <= 86400.0:
         raise InputError("time_limit", limit, "0 (the node's default) to 86400 s")
     sigma = float(request.sigma)
-    if not 0 <= sigma <= 1.0:
-        raise InputError("sigma", sigma, "0 (the node's default) to 1 m")
+    if not (sigma == 0 or SMALLEST_SIGMA <= sigma <= 1.0):
+        raise InputError("sigma", sigma, f"0 (the node's default), or {SMALLEST_SIGMA:g} to 1 m")
     criterion = request.criterion or settings.criterion
     candidates = _candidates(request, settings, robot)
     real = model.described and candidates is not None and criterion == "test_pose"
@@ -110,7 +114,7 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         poses,
         size,
         repetitions=int(request.repetitions) or settings.repetitions,
-        weights=list(request.test_pose_weights) or None,
+        weights=_weights(request),
         sigma=sigma or settings.sigma,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
@@ -155,7 +159,22 @@ def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> Floa
     if len(rows) > settings.most_candidates:
         advice = "raise the node's parameter most_candidates if you mean it"
         raise InputError("candidates", f"{len(rows)} rows", f"at most {settings.most_candidates}", advice)
+    low, high = robot.joint_limits.T
+    outside = (rows < low - 1e-6) | (rows > high + 1e-6)
+    if outside.any():  # a robot may be sent there
+        i, j = (int(k) for k in np.argwhere(outside)[0])
+        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
+        raise InputError(f"candidates[{i}]", f"{rows[i, j]:g}", expected)
     return rows
+
+
+def _weights(request: Any) -> FloatArray | None:
+    """Relative to the largest, since only that matters and sums of huge ones overflow."""
+    given = np.asarray(request.test_pose_weights, float)
+    if not given.size:
+        return None
+    largest = float(given.max())
+    return given / largest if 0 < largest < np.inf else given
 
 
 def _model(request: Any, settings: PlannerParameters, own: Model | NotReady) -> Model:

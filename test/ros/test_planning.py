@@ -49,6 +49,8 @@ BAD: list[tuple[dict[str, Any], str, str]] = [
     ({"sigma": -1.0}, "INVALID_REQUEST", "sigma"),
     ({"sigma": math.nan}, "INVALID_REQUEST", "sigma"),
     ({"sigma": 5.0}, "INVALID_REQUEST", "sigma"),
+    ({"sigma": 1e-300}, "INVALID_REQUEST", "sigma"),
+    ({"candidates": [0.1, 100.0] * 9}, "INVALID_REQUEST", "candidates"),
     ({"time_limit": -1.0}, "INVALID_REQUEST", "time_limit"),
     ({"time_limit": math.inf}, "INVALID_REQUEST", "time_limit"),
     ({"candidates": [0.1, 0.2, 0.3]}, "INVALID_REQUEST", "candidates"),
@@ -118,6 +120,14 @@ def test_candidates_are_chosen_among() -> None:
     assert found is not None
     assert all((pool == q).all(axis=1).any() for q in found.configurations)
     assert len(np.unique(found.configurations, axis=0)) == 4
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1.0, 1e308])
+def test_only_relative_weights_matter(scale: float) -> None:
+    request = PlanCalibration.Request(test_poses=[*POSE, -0.4, 1.0], test_pose_weights=[scale, 0.5 * scale])
+    found = answer(request, SETTINGS, OWN).plan
+    assert found is not None
+    np.testing.assert_allclose(found.weights, [2 / 3, 1 / 3], rtol=1e-12)
 
 
 def test_without_a_robot_only_shipped_ones() -> None:
