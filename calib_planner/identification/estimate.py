@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from calib_planner._arrays import FloatArray, check_configurations, frozen
 from calib_planner.design.plan import plain
 from calib_planner.identification.noise_levels import NoiseLevels
+from calib_planner.identification.order_check import Disturbance
 from calib_planner.identification.structure import Structure
 from calib_planner.identification.transmission import Transmission
 from calib_planner.identification.verdict import Verdict, judge
@@ -132,6 +133,8 @@ class Estimate:
         parameter_accuracy_per_test_pose: (K,) ρ0 of eq. (14) with the covariance found [m].
         discrepancy_per_test_pose: (K,) what no geometric model holds there, root mean square distance [m].
         structure: Whether the residuals know where the robot stood; see ``structure``.
+        disturbances: What seems to have moved during the campaign; see ``order_check``.
+        moved_since: First row of those at the end that were all rejected, or ``None``.
         transmission: The complete model with the joints' own errors, if the data show them; else ``None``.
         starts, agreeing_starts: Other starts made, and those that ended in the same minimum.
         iterations: Iterations of the last fit.
@@ -176,6 +179,8 @@ class Estimate:
     parameter_accuracy_per_test_pose: FloatArray
     discrepancy_per_test_pose: FloatArray
     structure: tuple[Structure, ...]
+    disturbances: tuple[Disturbance, ...]
+    moved_since: int | None
     transmission: Transmission | None
     starts: int
     agreeing_starts: int
@@ -278,6 +283,8 @@ class Estimate:
             "residuals": self.residuals,
             "normalised_residuals": self.normalised_residuals,
             "structure": [asdict(s) for s in self.structure],
+            "disturbances": [asdict(d) for d in self.disturbances],
+            "moved_since": self.moved_since,
             "joint_corrections": None if self.transmission is None else self.transmission.to_dict(),
             "starts": self.starts,
             "agreeing_starts": self.agreeing_starts,

@@ -20,6 +20,7 @@ from calib_planner.identification.estimate import (
 from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import NoiseLevels
+from calib_planner.identification.order_check import Disturbance
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
 from calib_planner.identification.structure import Structure
 from calib_planner.identification.suspicions import copied_rows, explain
@@ -49,6 +50,8 @@ class Evidence:
     normalised: FloatArray
     gate: float
     structure: tuple[Structure, ...]
+    disturbances: tuple[Disturbance, ...]
+    moved_since: int | None
     transmission: Transmission | None
     at: FloatArray
     jacobian: FloatArray
@@ -111,6 +114,8 @@ def estimate_of(evidence: Evidence) -> Estimate:
         parameter_accuracy_per_test_pose=precision,
         discrepancy_per_test_pose=discrepancy,
         structure=evidence.structure,
+        disturbances=evidence.disturbances,
+        moved_since=evidence.moved_since,
         transmission=evidence.transmission,
         starts=evidence.starts,
         agreeing_starts=evidence.agreeing,

@@ -59,7 +59,9 @@ class Fit:
         return result
 
 
-def gauss_newton(equations: Equations, start: FloatArray, kept: tuple[int, ...], most: int) -> Fit:
+def gauss_newton(
+    equations: Equations, start: FloatArray, kept: tuple[int, ...], most: int, enough: float = 0.0
+) -> Fit:
     """Minimise the sum of squares over the parameters ``kept``.
 
     Args:
@@ -67,6 +69,7 @@ def gauss_newton(equations: Equations, start: FloatArray, kept: tuple[int, ...],
         start: (P,) deviations to begin from; those not kept stay as they are.
         kept: Indices of an irreducible set of parameters.
         most: Most iterations.
+        enough: Sum of squares below which it need not go on.
     """
     columns = list(kept)
     deviations = start
@@ -80,18 +83,18 @@ def gauss_newton(equations: Equations, start: FloatArray, kept: tuple[int, ...],
         trial[columns] += step / scale
         cost, new_cost = float(residuals @ residuals), np.inf
         if np.isfinite(trial).all():
-            new = equations.residuals(trial)
+            # With its Jacobian at once: hardly any step is refused.
+            new, new_jacobian = equations.linearise(trial)
             new_cost = float(new @ new)
         size = float(np.linalg.norm(triangle @ step))
         small = size <= STEP_FLOOR + STEP_TOLERANCE * np.linalg.norm(residuals)
         if new_cost <= cost:
-            deviations = trial
-            residuals, jacobian = equations.linearise(deviations)
-            triangle, scale, right = _triangle(jacobian[:, columns], residuals)
+            deviations, residuals = trial, new
+            triangle, scale, right = _triangle(new_jacobian[:, columns], residuals)
             damping = 0.0 if damping < 1e-6 else damping / 10
         else:
             damping = max(10 * damping, 1e-6)
-        converged = bool(small)
+        converged = bool(small) or new_cost <= enough
     return Fit(deviations, tuple(kept), triangle, scale, residuals, done, converged)
 
 

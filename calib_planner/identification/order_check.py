@@ -44,6 +44,8 @@ SUSPICIOUS = 1e-2
 HARMLESS, HARMFUL = 1.0, 3.0
 """Standard deviations that a parameter may move without harm (thousands of rows show the smallest warm-up), and
 with much of it."""
+MOST_CUTS = 500
+"""Rows that are asked about at most, evenly spread."""
 FEWEST_SPARE = 6
 """Degrees of freedom that must be left beside a disturbance."""
 ABSORBED = 1e-9
@@ -255,17 +257,20 @@ class _Fit:
         owner = np.full(len(white), -1)
         owner[: 3 * int(use.sum())] = np.repeat(np.repeat(self.ranks[:, None], use.shape[1], axis=1)[use], 3)
         involved = np.unique(owner[np.any(white != 0.0, axis=1)])[1:]
-        explained, rank = np.zeros(len(involved)), np.zeros(len(involved), np.int64)
-        d = white.shape[1]
-        square, along = np.zeros((d, d)), np.zeros(d)
-        absorbed = np.zeros((self.basis.shape[1], d))
-        for k in range(len(involved) - 1, -1, -1):
-            rows = owner == involved[k]
+        involved = involved[np.unique(np.linspace(0, len(involved) - 1, MOST_CUTS).astype(int))]
+        by_row = np.argsort(owner, kind="stable")
+        starts = np.append(np.searchsorted(owner[by_row], involved), len(owner))
+        d, count = white.shape[1], len(involved)
+        square, along = np.zeros((count + 1, d, d)), np.zeros((count + 1, d))
+        absorbed = np.zeros((count + 1, self.basis.shape[1], d))
+        for k in range(count - 1, -1, -1):
+            rows = by_row[starts[k] : starts[k + 1]]
             part = white[rows]
-            square += part.T @ part
-            along += part.T @ self.residuals[rows]
-            absorbed += self.basis[rows].T @ part
-            explained[k], rank[k] = _explained(square - absorbed.T @ absorbed, square, along)
+            square[k] = square[k + 1] + part.T @ part
+            along[k] = along[k + 1] + part.T @ self.residuals[rows]
+            absorbed[k] = absorbed[k + 1] + self.basis[rows].T @ part
+        free = square - np.swapaxes(absorbed, 1, 2) @ absorbed
+        explained, rank = _explained(free[:-1], square[:-1], along[:-1])
         probability = self._probability(explained, rank)
         if not np.isfinite(probability).any():
             return None
@@ -281,8 +286,8 @@ class _Fit:
         """``columns`` (N, targets, 3, d) beside the parameters."""
         white = self._white(columns)
         square, absorbed, along = white.T @ white, self.basis.T @ white, white.T @ self.residuals
-        explained, rank = _explained(square - absorbed.T @ absorbed, square, along)
-        probability = float(self._probability(np.array([explained]), np.array([rank]))[0])
+        explained, rank = _explained((square - absorbed.T @ absorbed)[None], square[None], along[None])
+        probability = float(self._probability(explained, rank)[0])
         if not np.isfinite(probability):
             return None
         scale = np.sqrt(np.diag(square))
@@ -310,10 +315,11 @@ class _Fit:
         return np.where(known, fisher_f.sf(explained / rank / (left / spare), rank, spare), np.nan)
 
 
-def _explained(free: FloatArray, square: FloatArray, along: FloatArray) -> tuple[float, int]:
-    """S = bᵀ G⁺ b and the rank of G = ``free``; ``square`` gives the columns' lengths."""
-    scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-    values, vectors = np.linalg.eigh(free / np.outer(scale, scale))
+def _explained(free: FloatArray, square: FloatArray, along: FloatArray) -> tuple[FloatArray, IntArray]:
+    """(n,) S = bᵀ G⁺ b and rank of G = ``free`` (n, d, d); ``square`` gives lengths, b = ``along``."""
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", square), 1e-300))
+    values, vectors = np.linalg.eigh(free / (scale[:, :, None] * scale[:, None, :]))
     seen = values > ABSORBED
-    projected = vectors[:, seen].T @ (along / scale)
-    return float(np.sum(projected**2 / values[seen])), int(seen.sum())
+    projected = np.einsum("nij,ni->nj", vectors, along / scale)
+    shares = np.where(seen, projected**2 / np.where(seen, values, 1.0), 0.0)
+    return shares.sum(axis=1), seen.sum(axis=1)

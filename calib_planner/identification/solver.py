@@ -23,6 +23,12 @@ from calib_planner.identification.evidence import Evidence, estimate_of
 from calib_planner.identification.least_squares import gauss_newton
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import improbable
+from calib_planner.identification.order_check import (
+    Disturbance,
+    check_order,
+    rejected_since,
+    wholly_whitened,
+)
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
 from calib_planner.identification.robust import (
@@ -84,6 +90,8 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         at=work.at,
         jacobian=work.jacobian,
         structure=structure,
+        disturbances=_disturbances(work, found),
+        moved_since=rejected_since(problem.data.seen, found.equations.use),
         transmission=_transmission(work, found, structure),
         starts=starts,
         agreeing=agreeing,
@@ -181,8 +189,9 @@ def _other_starts(work: Work, found: Weighed) -> tuple[Weighed, int, int]:
     for _ in range(work.problem.starts):
         first = found.fit.deviations.copy()
         first[kept] += spread[kept] * rng.standard_normal(len(kept))
-        other = gauss_newton(found.equations, first, found.fit.kept, work.problem.iterations)
         close = 1e-6 * best.cost + 1e-6
+        same = best.cost + 0.5 * close
+        other = gauss_newton(found.equations, first, found.fit.kept, work.problem.iterations, enough=same)
         if other.cost < best.cost - close and other.converged:
             best, agreeing = other, 0
         agreeing += int(abs(other.cost - best.cost) <= close)
@@ -191,7 +200,7 @@ def _other_starts(work: Work, found: Weighed) -> tuple[Weighed, int, int]:
     return found, work.problem.starts, agreeing
 
 
-# ── do the residuals know where the robot stood? ─────────────────────────────────────────────────────
+# ── do the residuals know where the robot stood, or when? ─────────────────────────────────────────────────────
 
 
 def _structure(work: Work, found: Weighed) -> tuple[Structure, ...]:
@@ -209,3 +218,12 @@ def _transmission(work: Work, found: Weighed, structure: tuple[Structure, ...]) 
     unknown = found.levels.source == "residuals"
     instrument = TINY * work.instrument if unknown else found.levels.scaled**2 * work.instrument
     return fit_transmission(found.equations, found.fit.deviations, found.fit.kept, instrument, work.labels)
+
+
+def _disturbances(work: Work, found: Weighed) -> tuple[Disturbance, ...]:
+    """What seems to have moved during the campaign, and matters."""
+    if not found.fit.converged:
+        return ()
+    white = wholly_whitened(found.equations, work.instrument, found.levels, work.labels)
+    asked = check_order(white, found.fit.deviations, found.fit.kept, found.covariance)
+    return tuple(d for d in asked if d.matters)

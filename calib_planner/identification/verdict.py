@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib_planner.identification.order_check import HARMFUL
 from calib_planner.identification.structure import SIGNIFICANT
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class Verdict:
 
 def judge(estimate: Estimate) -> Verdict:
     """Look at an estimate from every side."""
-    checks = (_solution, _data, _rejections, _scatter, _structure, _parameters, _accuracy, _held_out)
+    checks = (_solution, _data, _rejections, _scatter, _order, _structure, _parameters, _accuracy, _held_out)
     reasons = [reason for check in checks for reason in check(estimate)]
     reasons.sort(key=lambda r: -LEVELS.index(r.level))
     return Verdict(reasons[0].level if reasons else "PASS", tuple(reasons))
@@ -134,6 +135,25 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
     elif probability > 1.0 - 1e-6:
         text = f"the residuals scatter {mm(e.sigma_estimate)}, far less than the {mm(noise.measurement)} stated"
         yield Reason("WARN", "noise_overstated", text, "the standard deviations are too large: check sigma")
+
+
+def _order(e: Estimate) -> Iterator[Reason]:
+    words = {"drift": "the tracker drifted", "bump": "the tracker was moved", "reseat": "was seated elsewhere"}
+    for found in e.disturbances:
+        level = "FAIL" if found.certain and found.shift > HARMFUL else "WARN"
+        who = f"target {found.target} " if found.target else ""
+        when = "" if found.row is None else f" before row {found.row}"
+        far = float(np.linalg.norm(found.translation))
+        text = (
+            f"{who}{words[found.kind]}{when}, it seems, by {mm(far)} (by chance {found.probability:.1g}); "
+            f"{found.parameter} may be off by {found.shift:.2g} standard deviations"
+        )
+        yield Reason(
+            level, found.kind, text, "measure again, or identify the parts before and after on their own"
+        )
+    if e.moved_since is not None:
+        text = f"every point from row {e.moved_since} on was rejected: something moved for good"
+        yield Reason("WARN", "moved", text, "the fit is to the rows before; measure those after again")
 
 
 def _structure(e: Estimate) -> Iterator[Reason]:

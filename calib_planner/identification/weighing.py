@@ -2,14 +2,16 @@
 
 The first fit takes the instrument's word. Repetitions may contradict it. Residuals that it does not explain have
 a discrepancy (see ``noise_levels``), which the points of a configuration share, and then the covariance of least
-squares with weights W = R⁻¹ is no longer eq. (11) but
+squares is no longer eq. (11) but, with weights W = (R + d² I)⁻¹, d² the mean square of the discrepancy,
 
     cov(Π̂) = N⁻¹ Jᵀ W Σ W J N⁻¹,     N = Jᵀ W J,     Σ = R + D.
 
-The weights stay the instrument's: on measured robots those of Σ⁻¹ did not predict better, and they rest on more
-assumptions (docs/theory.md). Where no instrument says anything, the residuals give the scale, eq. (11) with σ̂².
-If the targets of one configuration then err alike, it is two scales: what differs between them is the
-measurement, what they share is the robot.
+So points count about alike where the discrepancy is larger than their noise. Weights Σ⁻¹ did not predict better
+on measured robots, and rest on more assumptions (docs/theory.md).
+
+Where no instrument says anything, the residuals give the scale, eq. (11) with σ̂². If the targets of one
+configuration then err alike, it is two scales: what differs between them is the measurement, what they share is
+the robot.
 """
 
 from __future__ import annotations
@@ -83,7 +85,8 @@ def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
     cost = fit.cost
     levels = replace(levels, measurement=float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0)))
     found = Weighed(equations, fit, levels, instrument, instrument, fit.covariance(), cost, freedom)
-    if work.problem.discrepancy == "off" or not improbable(cost, freedom) or seen <= len(work.kept):
+    told_by = repeats if source == "repetitions" else 0
+    if work.problem.discrepancy == "off" or not improbable(cost, freedom, told_by) or seen <= len(work.kept):
         return found
     return _with_discrepancy(work, found, instrument)
 
@@ -117,10 +120,8 @@ def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Wei
     prior = equations.prior_rows(found.fit.deviations)
     residuals = (data.p - predicted)[equations.use].ravel()
     variances = estimate_variances(model, residuals, rows, (prior[0][:, columns], prior[1]))
-    own = float(np.mean(np.einsum("kii->k", instrument[equations.use]))) / 3.0
-    raised = 1.0 + model.mean_square(variances) / own
-    # All points alike: what the prior is worth beside them depends on how far they scatter.
-    equations = work.equations(equations.use, raised * instrument)
+    weights = instrument + model.mean_square(variances) * np.eye(3)
+    equations = work.equations(equations.use, weights)
     fit = gauss_newton(equations, found.fit.deviations, found.fit.kept, work.problem.iterations)
     levels = replace(found.levels, **dict(zip(model.names, np.sqrt(variances).tolist(), strict=True)))
     measured, left = instrument, variances
@@ -135,24 +136,25 @@ def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Wei
         equations=equations,
         fit=fit,
         levels=levels,
-        weights=raised * instrument,
+        weights=weights,
         total=measured + levels.discrepancy_covariance(work.robot, data.q),
-        covariance=_sandwich(equations, fit, model, variances, raised),
+        covariance=_sandwich(equations, fit, model, variances, weights),
     )
 
 
 def _sandwich(
-    equations: Equations, fit: Fit, model: DiscrepancyModel, variances: FloatArray, raised: float
+    equations: Equations, fit: Fit, model: DiscrepancyModel, variances: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """N⁻¹ (JᵀWΣWJ + prior) N⁻¹ for W = (raised · R)⁻¹."""
-    _, jacobian = equations.linearise(fit.deviations)
-    count = len(model.columns[0])
-    own = jacobian[:count]
-    middle = own.T @ own / raised + jacobian[count:].T @ jacobian[count:]
+    """N⁻¹ (JᵀWΣWJ + prior) N⁻¹ for W⁻¹ = ``weights`` (N, targets, 3, 3)."""
+    data, use, count = equations.data, equations.use, len(fit.deviations)
+    jacobian = equations.robot.jacobian(data.q, fit.deviations).reshape(*data.p.shape, -1)[use]
+    pulled = np.linalg.solve(weights[use], jacobian)
+    rows, _ = equations.prior_rows(fit.deviations)
+    middle = rows.T @ rows + np.einsum("kia,kij,kjb->ab", pulled, model.instrument, pulled, optimize=True)
+    flat = pulled.reshape(-1, count)
     for variance, columns in zip(variances, model.columns, strict=True):
-        white = equations.whitening.apply(columns)
         for index in model.blocks:
-            shared = np.swapaxes(white[index], 1, 2) @ own[index]
+            shared = np.swapaxes(columns[index], 1, 2) @ flat[index]
             middle += variance * np.einsum("gka,gkb->ab", shared, shared, optimize=True)
     inverse = fit.covariance()
     return inverse @ middle @ inverse
