@@ -9,8 +9,7 @@ depend on the order in which measurements came and went: it is that of the same 
 
 That holds where there is one minimum to go to. With few data there may be several, and the way tells which is
 found: so the way is the batch's, from nominal values, until there are twice as many equations as parameters, and
-after an iteration that did not settle. So it is with the robust loss and with a prior, where the place to begin
-could tip a decision, and where other parameters are held than before.
+after an iteration that did not settle.
 
 An information matrix that is updated by a row would be faster and another answer: every new point moves the
 linearisation, the closed-form start of an unknown tracker pose, the noise and the points that are believed.
@@ -45,7 +44,7 @@ from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.solver import identify
 from calib_planner.robot.chain import Robot
 
-UPDATE: Mapping[str, Any] = MappingProxyType({"starts": 0, "joint_corrections": "off"})
+UPDATE: Mapping[str, Any] = MappingProxyType({"starts": 0, "joint_corrections": "off", "order_check": "off"})
 """Settings that are other than a problem's own where they are not given."""
 
 
@@ -180,18 +179,10 @@ class Accumulator:
     @cached_property
     def _answer(self) -> Estimate | NotEnoughDataError:
         try:
-            return _identified(self.problem, self.start)
+            start = self.start if self.start is not None and _leads(self.start) else None
+            return identify(self.problem, start)
         except NotEnoughDataError as error:
             return error
-
-
-def _identified(problem: IdentificationProblem, start: Estimate | None) -> Estimate:
-    """``identify``, begun from ``start`` where that cannot tip a decision."""
-    if start is not None and _leads(start) and problem.loss == "linear" and problem.prior is None:
-        warm = identify(problem, start)
-        if warm.held == start.held:
-            return warm
-    return identify(problem)
 
 
 def _leads(estimate: Estimate) -> bool:

@@ -48,6 +48,8 @@ class Whitening:
     def apply(self, rows: FloatArray) -> FloatArray:
         """L⁻¹ times ``rows`` (equations,) or (equations, columns)."""
         flat = rows if rows.ndim == 2 else rows[:, None]
+        if self.factor[0].ndim == 2:  # one by one, in their order
+            return (self.factor[0] * flat).reshape(rows.shape)
         result = np.empty_like(flat)
         for index, factor in zip(self.index, self.factor, strict=True):
             if factor.ndim == 2:
@@ -103,6 +105,8 @@ class Equations:
 def configuration_labels(q: FloatArray) -> IntArray:
     """(N,) number of the configuration of each row of ``q`` (N, joints); repetitions share it."""
     pairs = cKDTree(q).query_pairs(SAME_JOINT, p=np.inf, output_type="ndarray")
+    if not len(pairs):
+        return np.arange(len(q))
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(q), len(q)))
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
 

@@ -17,10 +17,12 @@ from scipy.linalg import solve_triangular
 from calib_planner._arrays import FloatArray
 from calib_planner.identification.equations import Equations
 
-STEP_TOLERANCE = 1e-7
+STEP_TOLERANCE = 1e-9
 """A step that moves the predictions by less than this share of the residuals ends the iteration."""
-STEP_FLOOR = 1e-8
+STEP_FLOOR = 1e-9
 """The same without residuals, in standard deviations."""
+ROUNDING = 1e-9
+"""A sum of squares that is larger by this share at most is not larger: near the minimum rounding decides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +83,24 @@ def gauss_newton(
         step = _step(triangle, right, damping)
         trial = deviations.copy()
         trial[columns] += step / scale
+        size = float(np.linalg.norm(triangle @ step))
+        converged = bool(size <= STEP_FLOOR + STEP_TOLERANCE * np.linalg.norm(residuals))
+        if converged and not damping:
+            # Nothing changes by so small a step but the parameters that hardly anything depends on.
+            deviations, residuals = trial, residuals - jacobian[:, columns] @ (step / scale)
+            break
         cost, new_cost = float(residuals @ residuals), np.inf
         if np.isfinite(trial).all():
             # With its Jacobian at once: hardly any step is refused.
             new, new_jacobian = equations.linearise(trial)
             new_cost = float(new @ new)
-        size = float(np.linalg.norm(triangle @ step))
-        small = size <= STEP_FLOOR + STEP_TOLERANCE * np.linalg.norm(residuals)
-        if new_cost <= cost:
-            deviations, residuals = trial, new
-            triangle, scale, right = _triangle(new_jacobian[:, columns], residuals)
+        if new_cost <= (1.0 + ROUNDING) * cost:
+            deviations, residuals, jacobian = trial, new, new_jacobian
+            triangle, scale, right = _triangle(jacobian[:, columns], residuals)
             damping = 0.0 if damping < 1e-6 else damping / 10
         else:
             damping = max(10 * damping, 1e-6)
-        converged = bool(small) or new_cost <= enough
+        converged = converged or new_cost <= enough
     return Fit(deviations, tuple(kept), triangle, scale, residuals, done, converged)
 
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 from scipy.stats import f as fisher_f
 
 from calib_planner._arrays import FloatArray, IntArray
@@ -172,7 +172,7 @@ def improbable(cost: float, freedom: int, repeats: int = 0) -> bool:
             lack of fit); 0: the level is known.
     """
     if not repeats:
-        return freedom >= FEWEST_SPARE and float(chi2.sf(cost, freedom)) < DOUBT
+        return freedom >= FEWEST_SPARE and float(chdtrc(freedom, cost)) < DOUBT
     rest = freedom - repeats
     return rest >= FEWEST_SPARE and float(fisher_f.sf((cost - repeats) / rest, rest, repeats)) < DOUBT
 

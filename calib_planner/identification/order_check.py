@@ -257,6 +257,8 @@ class _Fit:
         owner = np.full(len(white), -1)
         owner[: 3 * int(use.sum())] = np.repeat(np.repeat(self.ranks[:, None], use.shape[1], axis=1)[use], 3)
         involved = np.unique(owner[np.any(white != 0.0, axis=1)])[1:]
+        if not len(involved):
+            return None
         involved = involved[np.unique(np.linspace(0, len(involved) - 1, MOST_CUTS).astype(int))]
         by_row = np.argsort(owner, kind="stable")
         starts = np.append(np.searchsorted(owner[by_row], involved), len(owner))

@@ -41,6 +41,7 @@ class IdentificationProblem:
             is estimated, weighs the points and adds to every predicted accuracy; ``off``: they are not.
         joint_corrections: ``auto``: if the residuals know where the robot stood, errors of the joints'
             transmissions are looked for and, where the data show them, learnt; ``off``: they are not.
+        order_check: ``auto``: ask whether the residuals know when they were measured; ``off``: do not.
         starts: Other starts that must end in the same minimum.
         required_accuracy: Largest error at a pose that the user can live with [m], for the verdict.
     """
@@ -55,6 +56,7 @@ class IdentificationProblem:
     instrument: Noise | None = None
     discrepancy: str = "auto"
     joint_corrections: str = "auto"
+    order_check: str = "auto"
     starts: int = 2
     required_accuracy: float | None = None
 
@@ -75,7 +77,7 @@ class IdentificationProblem:
             put(self, "sigma", check_number("sigma", self.sigma, low=0, low_open=True, unit="m"))
         if self.loss not in LOSSES:
             raise UnknownNameError("loss", str(self.loss), LOSSES)
-        for name in ("discrepancy", "joint_corrections"):
+        for name in ("discrepancy", "joint_corrections", "order_check"):
             if getattr(self, name) not in AUTOMATIC:
                 raise UnknownNameError(name, str(getattr(self, name)), AUTOMATIC)
         if self.sigma is not None and self.instrument is not None:

@@ -26,7 +26,13 @@ from calib_planner.robot.chain import Robot
 
 
 def register(
-    robot: Robot, data: Measurements, *, base: bool, tool: bool, weights: FloatArray | None = None
+    robot: Robot,
+    data: Measurements,
+    *,
+    base: bool,
+    tool: bool,
+    weights: FloatArray | None = None,
+    poses: tuple[FloatArray, FloatArray] | None = None,
 ) -> Robot:
     """``robot`` with the base pose and target offsets that fit the nominal kinematics best.
 
@@ -34,13 +40,14 @@ def register(
         base: The tracker's pose is unknown; otherwise the robot's base pose is kept.
         tool: The target offsets are unknown; otherwise the robot's targets are kept.
         weights: (N, targets) >= 0, how much each point counts; default all alike.
+        poses: ``tip_poses`` of these data, where they are known already.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknowns, or all configurations alike.
     """
     if not (base or tool):
         return robot
-    rotations, origins = _tip_poses(robot, data.q, at_base=base)
+    rotations, origins = poses or tip_poses(robot, data.q, at_base=base)
     row, target = np.nonzero(data.seen)
     p, r, o = data.p[row, target], rotations[row], origins[row]
     root = np.ones(len(row)) if weights is None else np.sqrt(weights[row, target])
@@ -113,7 +120,7 @@ def _solve(system: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(system, right, rcond=1e-10)[0], np.float64)
 
 
-def _tip_poses(robot: Robot, q: FloatArray, *, at_base: bool) -> tuple[FloatArray, FloatArray]:
+def tip_poses(robot: Robot, q: FloatArray, *, at_base: bool) -> tuple[FloatArray, FloatArray]:
     """Rotation (N, 3, 3) and origin (N, 3) of the tip, from four points fixed to it."""
     if at_base:
         robot = robot.with_base(np.eye(3), np.zeros(3))

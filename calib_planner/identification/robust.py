@@ -20,7 +20,7 @@ from scipy.stats import f as fisher_f
 from calib_planner._arrays import FloatArray
 from calib_planner.identification.equations import Equations
 from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.registration import register
+from calib_planner.identification.registration import register, tip_poses
 from calib_planner.robot.chain import Robot
 
 ALARM = 0.01
@@ -60,8 +60,8 @@ def robust_registration(robot: Robot, data: Measurements, *, base: bool, tool: b
     """``register`` with far points counting little."""
     if not (base or tool):
         return robot
-    weights = np.ones(data.seen.shape)
-    found = register(robot, data, base=base, tool=tool)
+    weights, poses = np.ones(data.seen.shape), tip_poses(robot, data.q, at_base=base)
+    found = register(robot, data, base=base, tool=tool, poses=poses)
     for _ in range(30):
         lengths = np.linalg.norm(data.p - found.positions(data.q), axis=2)
         scale = float(np.nanmedian(lengths))
@@ -70,7 +70,7 @@ def robust_registration(robot: Robot, data: Measurements, *, base: bool, tool: b
         new = np.where(data.seen, 1.0 / (1.0 + (lengths / scale) ** 2), 0.0)
         settled = np.nanmax(np.abs(new - weights)) < 1e-3
         weights = new
-        found = register(robot, data, base=base, tool=tool, weights=weights)
+        found = register(robot, data, base=base, tool=tool, weights=weights, poses=poses)
         if settled:
             break
     return found
@@ -145,11 +145,17 @@ def residual_covariance(
         use: Whether a point took part: L(I − H)Lᵀ with Σ = LLᵀ and the hat matrix H of the whitened equations,
             which is Σ − JCJᵀ where W = Σ⁻¹; else Σ + JCJᵀ.
     """
-    whitener = np.linalg.inv(np.linalg.cholesky(weights))
-    rows = whitener @ jacobian
+    jacobian = np.ascontiguousarray(jacobian)
+    rows = np.linalg.inv(np.linalg.cholesky(weights)) @ jacobian
     # A point that alone determines a parameter has no residual variance: a floor keeps 0/0 at 0.
-    left = (1.0 + 1e-6) * np.eye(3) - rows @ inverse @ np.swapaxes(rows, 2, 3)
+    left = (1.0 + 1e-6) * np.eye(3) - _spread(rows, inverse)
     lower = np.linalg.cholesky(total)
     inside = lower @ left @ np.swapaxes(lower, 2, 3)
-    outside = total + jacobian @ parameters @ np.swapaxes(jacobian, 2, 3)
+    outside = total + _spread(jacobian, parameters)
     return np.where(use[:, :, None, None], inside, outside)
+
+
+def _spread(rows: FloatArray, matrix: FloatArray) -> FloatArray:
+    """J C Jᵀ of each block of rows (N, targets, 3, P), the first product of all at once."""
+    half = (rows.reshape(-1, rows.shape[3]) @ matrix).reshape(rows.shape)
+    return np.asarray(half @ np.swapaxes(rows, 2, 3))

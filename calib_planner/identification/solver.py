@@ -70,7 +70,10 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
     seen = problem.data.seen
     robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
     check_count(problem, seen)
-    work, first = without_unseen(Work.of(problem, robot), seen, start)
+    # What is decided on the way is decided from nominal: no start can tip it.
+    work, first = without_unseen(Work.of(problem, robot), seen, None)
+    if start is not None and problem.loss == "linear":
+        first = work.start_values(start)
     found = _robust(work, first) if problem.loss == "robust" else weigh(work, seen, first)
     found, starts, agreeing = _other_starts(work, found)
     structure = _structure(work, found)
@@ -222,7 +225,7 @@ def _transmission(work: Work, found: Weighed, structure: tuple[Structure, ...]) 
 
 def _disturbances(work: Work, found: Weighed) -> tuple[Disturbance, ...]:
     """What seems to have moved during the campaign, and matters."""
-    if not found.fit.converged:
+    if work.problem.order_check == "off" or not found.fit.converged:
         return ()
     white = wholly_whitened(found.equations, work.instrument, found.levels, work.labels)
     asked = check_order(white, found.fit.deviations, found.fit.kept, found.covariance)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.identification.discrepancy import joint_features
@@ -94,7 +94,7 @@ def _neighbours(robot: Robot, q: FloatArray, r: FloatArray) -> Structure:
     z = statistic / deviation if deviation > 0 else 0.0
     size = float(np.trace(moment))
     correlation = statistic / (n * size) if size > 0 else 0.0
-    return Structure("neighbours", "", correlation, float(norm.sf(z)), float(np.sqrt(size)), "m")
+    return Structure("neighbours", "", correlation, float(ndtr(-z)), float(np.sqrt(size)), "m")
 
 
 def _configuration(r: FloatArray, seen: NDArray[np.bool_]) -> Structure | None:
@@ -106,9 +106,7 @@ def _configuration(r: FloatArray, seen: NDArray[np.bool_]) -> Structure | None:
     total = r.sum(axis=1)
     statistic = 0.5 * float(np.sum(total**2) - np.sum(r**2))
     z = statistic / np.sqrt(pairs * float(np.sum(moment**2)))
-    return Structure(
-        "configuration", "", statistic / (pairs * size), float(norm.sf(z)), float(np.sqrt(size)), "m"
-    )
+    return Structure("configuration", "", statistic / (pairs * size), float(ndtr(-z)), float(np.sqrt(size)), "m")
 
 
 def _one_joint(robot: Robot, k: int, angle: FloatArray, r: FloatArray, lever: FloatArray) -> Structure | None:
@@ -122,7 +120,7 @@ def _one_joint(robot: Robot, k: int, angle: FloatArray, r: FloatArray, lever: Fl
     if square == 0.0:
         return None
     correlation = float(np.sum(y[1:] * y[:-1])) / ((len(y) - 1) * square)
-    probability = float(norm.sf(correlation * np.sqrt(len(y) - 1)))
+    probability = float(ndtr(-correlation * np.sqrt(len(y) - 1)))
     amplitude = float(np.sqrt(square / np.mean(length**2)))
     unit = "rad" if robot.joint_is_revolute[k] else "m"
     return Structure("joint", robot.joint_names[k], correlation, probability, amplitude, unit)
