@@ -1,6 +1,6 @@
 """docs/reference/interfaces.md: what the nodes offer and take, and every message, service and action. Needs ROS.
 
-The nodes are made and configured, and asked for their publishers, subscriptions, services and actions; the
+The nodes are made and activated, and asked for their publishers, subscriptions, services and actions; the
 interfaces are read from their text, with the comments.
 """
 
@@ -20,8 +20,8 @@ LINE = re.compile(r"^(?P<type>[\w/\[\]<=]+)\s+(?P<name>\w+)\s*(?:=\s*(?P<value>\
 
 INTRODUCTION = """\
 What the nodes offer and take with their default parameters, and every field of package `calib_planner_msgs` with
-its unit. Names are relative; `~` is the node's name. *Latched* (transient local): a late joiner gets the newest.
-Left out are parameter services, logging, and what
+its unit. Names without a leading `/` are relative; `~` is the node's name. *Latched* (transient local): a late
+joiner gets the newest. Left out are parameter services, logging, and what
 [lifecycle nodes](https://design.ros2.org/articles/node_lifecycle.html) have. The quality of service of our topics
 can be overridden by parameters `qos_overrides.TOPIC.publisher.…`."""
 
@@ -32,6 +32,8 @@ LEFT_OUT = re.compile(
 KEPT = "joint_states"
 DOMAIN = 187
 """Away from nodes that run on this machine."""
+NAMESPACE = "/cell"
+"""Where the nodes are asked, so that relative names can be told from absolute ones."""
 
 
 def page() -> str:
@@ -56,14 +58,15 @@ def nodes() -> dict[str, list[tuple[str, ...]]]:
     from calib_planner.ros.simulator_node import SimulatorNode
 
     context = Context()
-    context.init(args=[], domain_id=DOMAIN)
+    context.init(args=["--ros-args", "-r", f"__ns:={NAMESPACE}"], domain_id=DOMAIN)
     found = {}
     try:
         for kind in (PlannerNode, IdentifierNode, SimulatorNode):
             node = kind(context=context)
-            if hasattr(node, "trigger_configure"):
-                node.trigger_configure()
+            node.trigger_configure()
+            node.trigger_activate()
             found[node.get_name()] = sorted(set(_ends(node)), key=lambda row: (_ORDER.index(row[1]), row[0]))
+            node.trigger_deactivate()
             node.destroy_node()
     finally:
         context.try_shutdown()
@@ -76,7 +79,7 @@ _ORDER = ("offers action", "offers service", "publishes", "hears", "calls")
 def _ends(node: Any) -> Iterator[tuple[str, ...]]:
     from rclpy.action import get_action_server_names_and_types_by_node
 
-    own = f"/{node.get_name()}/"
+    own = f"{NAMESPACE}/{node.get_name()}/"
     for words, ends in (("publishes", node.publishers), ("hears", node.subscriptions)):
         for end in ends:
             topic = getattr(end, "topic_name", None) or end.topic
@@ -84,18 +87,18 @@ def _ends(node: Any) -> Iterator[tuple[str, ...]]:
     for words, services in (("offers service", node.services), ("calls", node.clients)):
         for service in services:
             yield from _end(own, getattr(service, "service_name", service.srv_name), words, service.srv_type)
-    for name, kinds in get_action_server_names_and_types_by_node(node, node.get_name(), ""):
+    for name, kinds in get_action_server_names_and_types_by_node(node, node.get_name(), NAMESPACE):
         yield code(_short(own, name)), "offers action", code(kinds[0].replace("/action/", "/")), ""
 
 
 def _end(own: str, name: str, words: str, kind: Any, quality: str = "") -> Iterator[tuple[str, ...]]:
-    if name.lstrip("/") == KEPT or not LEFT_OUT.search(name):
+    if _short(own, name) == KEPT or not LEFT_OUT.search(name):
         package = kind.__module__.split(".")[0]
         yield code(_short(own, name)), words, code(f"{package}/{kind.__name__}"), quality
 
 
 def _short(own: str, name: str) -> str:
-    return name.replace(own, "~/") if name.startswith(own) else name.lstrip("/")
+    return "~/" + name.removeprefix(own) if name.startswith(own) else name.removeprefix(f"{NAMESPACE}/")
 
 
 def _quality(profile: Any) -> str:

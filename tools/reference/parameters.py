@@ -35,7 +35,7 @@ def page() -> str:
 
 
 def _row(item: Field[Any]) -> tuple[str, ...]:
-    return code(item.name), _default(item), "; ".join(_range(item)), _meaning(item)
+    return code(item.name), _default(item), "; ".join(_range(item)) or "any text", _meaning(item)
 
 
 def _default(item: Field[Any]) -> str:
