@@ -76,7 +76,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self, name: str, defaults: P, context: Context | None = None, overrides: Sequence[Parameter] = ()
     ) -> None:
         self._made: list[ExitStack] = []  # before rclpy makes its own services, by our methods
-        self.failure, self.autostarted = "", False
+        self.failure, self.autostarted, self._ending = "", False, False
         super().__init__(name, context=context, parameter_overrides=list(overrides))
         service = self._service_change_state
         service.callback = self._safe_service(service.callback)
@@ -119,9 +119,12 @@ class ManagedNode(LifecycleNode, Generic[P]):
         return self.state == "active"
 
     def close(self) -> bool:
-        """End everything, when the process ends; whether that took no longer than a moment."""
-        while self._made:
-            self._leave("deactivate" if len(self._made) == 2 else "clean_up")
+        """End everything, when the process ends; whether that took no longer than a moment.
+
+        Publishers and services stay: a thread may be about to use them, and the process takes them along.
+        """
+        self._ending = True
+        self._leave_all()
         return True
 
     # ── transitions ──────────────────────────────────────────────────────────────────────────────────
@@ -152,14 +155,19 @@ class ManagedNode(LifecycleNode, Generic[P]):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Called by rclpy."""
-        self.close()
+        self._leave_all()
+        self.settings.in_use = False
         return SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Called by rclpy."""
-        self.close()
+        self._leave_all()
         self.settings.in_use = False
         return SUCCESS
+
+    def _leave_all(self) -> None:
+        while self._made:
+            self._leave("deactivate" if len(self._made) == 2 else "clean_up")
 
     def _enter(self, hook: str) -> TransitionCallbackReturn:
         """Run ``configure`` or ``activate``; undo it if it raises."""
@@ -211,7 +219,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
             return super().create_publisher(msg_type, topic, qos_profile, **others)
         others.setdefault("qos_overriding_options", overridable())
         made = super().create_publisher(msg_type, topic, own(qos_profile), **others)
-        self.undo_with(self.destroy_publisher, made)
+        self._destroy_with(self.destroy_publisher, made)
         return made
 
     def create_subscription(
@@ -222,7 +230,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
             return super().create_subscription(msg_type, topic, callback, qos_profile, **others)
         others.setdefault("qos_overriding_options", overridable())
         made = super().create_subscription(msg_type, topic, self._safe(callback), own(qos_profile), **others)
-        self.undo_with(self.destroy_subscription, made)
+        self._destroy_with(self.destroy_subscription, made)
         return made
 
     def create_service(
@@ -231,7 +239,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         """As rclpy's; an exception in the callback is logged and answered."""
         made = super().create_service(srv_type, srv_name, self._safe_service(callback), **others)
         if self._made:
-            self.undo_with(self.destroy_service, made)
+            self._destroy_with(self.destroy_service, made)
         return made
 
     def create_timer(
@@ -240,14 +248,14 @@ class ManagedNode(LifecycleNode, Generic[P]):
         """As rclpy's; an exception in the callback is logged."""
         made = super().create_timer(timer_period_sec, self._safe(callback), *args, **others)
         if self._made:
-            self.undo_with(self.destroy_timer, made)
+            self._destroy_with(self.destroy_timer, made)
         return made
 
     def create_client(self, *args: Any, **others: Any) -> Any:
         """As rclpy's."""
         made = super().create_client(*args, **others)
         if self._made:
-            self.undo_with(self.destroy_client, made)
+            self._destroy_with(self.destroy_client, made)
         return made
 
     def create_action_server(
@@ -256,8 +264,11 @@ class ManagedNode(LifecycleNode, Generic[P]):
         """An action server; ``execute`` answers its faults itself, since only it knows its result's words."""
         made = ActionServer(self, kind, name, execute, **others)
         if self._made:
-            self.undo_with(made.destroy)
+            self._destroy_with(made.destroy)
         return made
+
+    def _destroy_with(self, destroy: Callable[..., Any], *made: Any) -> None:
+        self.undo_with(lambda: None if self._ending else destroy(*made))
 
     # ── callbacks that do not end the process ────────────────────────────────────────────────────────
 
@@ -303,6 +314,10 @@ def failed(kind: Any, reason: str) -> Any:
         response.message = reason
     if hasattr(kind, "INTERNAL_ERROR"):
         response.status = kind.INTERNAL_ERROR
+    if hasattr(response, "results"):
+        response.results = [SetParametersResult(successful=False, reason=reason)]
+    elif isinstance(getattr(response, "result", None), SetParametersResult):
+        response.result = SetParametersResult(successful=False, reason=reason)
     return response
 
 

@@ -12,7 +12,8 @@ import math
 import threading
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
@@ -110,8 +111,8 @@ class PlannerNode(ManagedNode[PlannerParameters]):
             self.get_logger().info(f"{TOPIC}: {model.robot.name}, joints {joints}")
 
     def _on_request(self, request: PlanService.Request, response: PlanService.Response) -> PlanService.Response:
-        result = self._work(request, lambda _: self._closing.is_set())
-        return self._fill(response, result)
+        with self._turn() as mine:
+            return self._fill(response, self._work(mine, request, lambda _: self._closing.is_set()))
 
     def _on_goal(self, goal: ServerGoalHandle) -> PlanAction.Result:
         last = -math.inf
@@ -123,39 +124,48 @@ class PlannerNode(ManagedNode[PlannerParameters]):
                 goal.publish_feedback(feedback_message(state))
             return goal.is_cancel_requested or self._closing.is_set()
 
-        result = self._work(goal.request, progress)
-        response = self._fill(PlanAction.Result(), result)
-        if self.context.ok():
-            if goal.is_cancel_requested:
-                goal.canceled()
-            elif result.status == "SUCCESS":
-                goal.succeed()
-            else:
-                goal.abort()
+        with self._turn() as mine:
+            result = self._work(mine, goal.request, progress)
+            response = self._fill(PlanAction.Result(), result)
+            if self.context.ok():
+                if goal.is_cancel_requested:
+                    goal.canceled()
+                elif result.status == "SUCCESS":
+                    goal.succeed()
+                else:
+                    goal.abort()
         return response
 
     # ── planning ─────────────────────────────────────────────────────────────────────────────────────
 
+    @contextmanager
+    def _turn(self) -> Iterator[bool]:
+        """Whether it is the request's turn: one at a time, to the end of its answer."""
+        mine = self._busy.acquire(blocking=False)
+        try:
+            yield mine
+        finally:
+            if mine:
+                self._busy.release()
+
     def _work(
         self,
+        mine: bool,
         request: PlanService.Request | PlanAction.Goal,
         callback: Callable[[Progress], bool],
     ) -> Answer:
-        """The way of every request: one at a time, never an exception."""
+        """The answer to a request; never an exception."""
         if not self.is_active:
             return Answer("NOT_READY", "", f"the node is {self.state}, not active: activate it")
-        if not self._busy.acquire(blocking=False):
+        if not mine:
             return Answer("BUSY", "", "another request is being worked on: ask again later")
         began = time.perf_counter()
         try:
             result = answer(request, self.settings.value, self._source.model, callback)
         except Exception as error:
             result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {str(error)[:1000]}")
-        finally:
-            self._busy.release()
         if self.context.ok():
-            seconds = time.perf_counter() - began
-            text = f"{result.status} after {seconds:.2f} s: {result.message}"
+            text = f"{result.status} after {time.perf_counter() - began:.2f} s: {result.message}"
             if result.status == "INTERNAL_ERROR":
                 self.get_logger().error(text)
             else:

@@ -182,7 +182,9 @@ def test_a_parameter_of_no_type_is_survived(bench: Bench, kind: int, service: An
     bench.start(Small)
     request = service.Request(parameters=[ParameterMessage(name="size", value=ParameterValue(type=kind))])
     name = "set_parameters" if service is SetParameters else "set_parameters_atomically"
-    bench.call(service, f"small/{name}", request)
+    answer = bench.call(service, f"small/{name}", request)
+    (result,) = answer.results if service is SetParameters else [answer.result]
+    assert not result.successful and result.reason
     values = bench.call(GetParameters, "small/get_parameters", GetParameters.Request(names=["size"])).values
     assert values[0].integer_value == 3
 

@@ -69,7 +69,8 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
         try:
             client.wait(client._plan.service_is_ready, 20.0, "service")
             pose = [0.0, -1.0, 1.5, 0.0, 0.8, 0.0]
-            client._plan.call_async(PlanCalibration.Request(test_poses=pose, configurations=12))
+            long = PlanCalibration.Request(test_poses=pose, configurations=150, parameters=["full"])
+            client._plan.call_async(long)
             busy = PlanCalibration.Request(test_poses=pose, configurations=3)
 
             def planning() -> bool:
@@ -86,14 +87,14 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
 
 def test_a_node_that_fails_is_reported(tmp_path: Path) -> None:
     with Nodes(tmp_path, DOMAIN) as nodes:
-        nodes.start("planner_node", {"robot": "none"})
+        nodes.start("planner_node", {"robt": "planar_2r"})
         client = DemoClient(DOMAIN, nodes.check)
         try:
             with pytest.raises(ProcessFailed, match="planner_node ended with status 1") as caught:
                 client.wait(lambda: False, 20.0)
         finally:
             client.close()
-    assert "planar_2r" in str(caught.value) and "Traceback" not in str(caught.value)
+    assert "did you mean 'robot'" in str(caught.value) and "Traceback" not in str(caught.value)
 
 
 @pytest.mark.parametrize("option", [["--configurations", "0"], ["--seed", "-1"], ["--none"], ["--seed", "a"]])
