@@ -12,6 +12,7 @@ exclude_patterns = ["_build", "examples"]
 
 # Formulas are plain Unicode: nothing is fetched to show them, and they read the same in a terminal.
 highlight_language = "text"
+smartquotes = False  # --data must not become –data
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"

@@ -125,7 +125,9 @@ def test_codes_page_has_every_reason_of_the_verdict() -> None:
     written = set(re.findall(r'Reason\(\s*(?:"[A-Z]+"|level),\s*"(\w+)"', source))
     verdict = page.split("## Verdict")[1].split("\n## ")[0]
     assert len(written) > 15
-    assert set(re.findall(r"^\| `(\w+)` \| (?:PASS|WARN|FAIL)", verdict, re.MULTILINE)) == written
+    shown = set(re.findall(r"^\| `(\w+)` \| (?:PASS|WARN|FAIL)", verdict, re.MULTILINE))
+    assert written <= shown
+    assert shown - written == {"drift", "bump", "reseat"}, "their codes are kinds of disturbances, not literals"
 
 
 def test_interfaces_page_has_every_field_and_constant() -> None:

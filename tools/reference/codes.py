@@ -1,7 +1,8 @@
 """docs/reference/codes.md: every status, reason and error that a program may meet, with what to do.
 
 Statuses are dictionaries of the modules. The verdict's reasons are read from the source of ``verdict.py``: each
-is ``yield Reason(level, code, text, advice)``, where level, text and advice may have been assigned before.
+is ``yield Reason(level, code, text, advice)``, where level, text and advice may have been assigned before, and a
+dictionary of words has a code for each key.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ EXIT = {
 }
 
 Words = dict[str, str]
+KEY = "·key"
+"""Among the words: the key of the item that a dictionary of words stands for."""
 
 
 def page() -> str:
@@ -91,8 +94,12 @@ def _walk(body: list[ast.stmt], words: list[Words]) -> tuple[list[tuple[str, str
     rows = []
     for statement in body:
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            name = statement.targets[0].id
-            words = [{**known, name: _text(statement.value, known)} for known in words]
+            name, value = statement.targets[0].id, statement.value
+            if isinstance(value, ast.Dict):  # one reason for each of its items
+                items = [(_text(k, {}), _text(v, {})) for k, v in zip(value.keys, value.values, strict=True) if k]
+                words = [{**known, KEY: key, name: text} for known in words for key, text in items]
+            else:
+                words = [{**known, name: _text(value, known)} for known in words]
         elif isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Yield):
             rows += [_reason(statement.value.value, known) for known in words]
         elif isinstance(statement, ast.If):
@@ -106,6 +113,7 @@ def _walk(body: list[ast.stmt], words: list[Words]) -> tuple[list[tuple[str, str
 def _reason(call: ast.expr | None, words: Words) -> tuple[str, str, str, str]:
     assert isinstance(call, ast.Call)
     level, name, text, advice = ([_text(a, words) for a in call.args] + [""])[:4]
+    name = name if isinstance(call.args[1], ast.Constant) else words[KEY]
     level = " / ".join(sorted(level.split(" / "), key=verdict.LEVELS.index))
     return code(name), level, escaped(text), escaped(advice)
 
@@ -115,7 +123,11 @@ def _text(value: ast.expr, words: Words) -> str:
     if isinstance(value, ast.Constant):
         return str(value.value)
     if isinstance(value, ast.JoinedStr):
-        return "".join(str(v.value) if isinstance(v, ast.Constant) else "…" for v in value.values)
+        return "".join(_text(v, words) for v in value.values)
+    if isinstance(value, ast.FormattedValue):
+        return _text(value.value, words) if isinstance(value.value, ast.Subscript) else "…"
+    if isinstance(value, ast.Subscript) and isinstance(value.value, ast.Name):
+        return words.get(value.value.id, "…")
     if isinstance(value, ast.IfExp):
         either = (_text(v, words) for v in (value.body, value.orelse))
         return " / ".join(dict.fromkeys(filter(None, either)))
