@@ -109,7 +109,9 @@ def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, sc
         scale = float(np.median(squares)) / MEDIAN / freedom
         scale = max(scale, 1.0 if scale_known else LEAST_SCALE)
         new = 1.0 / (1.0 + squares / (3.0 * CAUCHY**2 * scale))
-        root = np.sqrt(np.append(np.repeat(new, 3) / scale, np.ones(prior)))
+        # The scale tells which points are far, not what a prior is worth: else points that are far from the
+        # prior's values would count little because of it, and stay far.
+        root = np.sqrt(np.append(np.repeat(new, 3), np.ones(prior)))
         rows = np.vstack([jacobian[:, columns] * root[:, None], np.eye(len(columns)) / FAR])
         right = np.append(residuals * root, -(deviations - start)[columns] / FAR)
         length = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
