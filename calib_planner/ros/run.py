@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
+import threading
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -16,27 +18,31 @@ from rclpy.executors import (
     SingleThreadedExecutor,
 )
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from calib_planner.errors import CalibPlannerError
+
+LAST_WORDS = 1.0
+"""Time for answers that are on their way when the process ends [s]."""
 
 
 def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = None) -> int:
     """Make the node, spin it, clean up once.
 
-    rclpy's own handlers shut the context down, and Python's are replaced, so that a second Ctrl-C during the
-    clean-up does no harm. See ``Ended`` for how the spinning comes to its end.
-
     Args:
+        make: Makes the node; its ``close``, if it has one, ends what is under way and says whether it did.
         threads: 1 for a node whose callbacks are all short: rclpy's executor of many threads costs several
             times the processor time per message.
+        args: Command line; default the process's own.
 
     Returns:
         Exit status.
     """
     ended = Ended()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ended.note)
-    rclpy.init(args=None if args is None else list(args))
+    ended.listen()
+    # Without rclpy's handlers the context outlives the signal, and whoever waits for an answer gets one.
+    words = None if args is None else list(args)
+    rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
         if ended.done():
@@ -60,6 +66,8 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
     finally:
         close = getattr(node, "close", None)
         in_time = close() if close is not None else True
+        if ended.executor is not None:
+            ended.executor.shutdown(timeout_sec=LAST_WORDS)
         rclpy.try_shutdown()
         if not in_time:
             # Python would wait for the thread that is still at work.
@@ -69,27 +77,37 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
 class Ended:
     """Whether the process was told to end; a future, as far as rclpy's executors use one.
 
-    rclpy wakes the executor before it shuts the context down. If the executor looks at the context in between, it
-    goes back to sleep, and nothing wakes it again. It does look at its future, though, and Python calls ``note``
-    before the executor's next step.
+    Python calls its signal handlers between two steps of the main thread, which sleeps in the middleware, and a
+    signal may arrive just before it goes to sleep. So a thread of its own waits for signals and wakes it; what it
+    wakes looks at ``done`` before it sleeps again.
     """
 
     def __init__(self) -> None:
         self._noted = False
         self.executor: Executor | None = None
 
-    def note(self, number: int, frame: object) -> None:
-        """A signal handler."""
-        self._noted = True
-        if self.executor is not None:
-            self.executor.wake()
+    def listen(self) -> None:
+        """From now on SIGINT and SIGTERM end the process; main thread only."""
+        self._read, self._write = socket.socketpair()
+        self._write.setblocking(False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: None)
+        signal.set_wakeup_fd(self._write.fileno(), warn_on_full_buffer=False)
+        threading.Thread(target=self._wait, daemon=True, name="signals").start()
+
+    def _wait(self) -> None:
+        while number := self._read.recv(1):
+            if number[0] in (signal.SIGINT, signal.SIGTERM):
+                self._noted = True
+                if self.executor is not None:
+                    self.executor.wake()
 
     def done(self) -> bool:
         """Called by rclpy."""
         return self._noted
 
     def add_done_callback(self, callback: object) -> None:
-        """Called by rclpy at every step, to be woken; ``note`` does that by itself."""
+        """Called by rclpy at every step, to be woken; ``_wait`` does that by itself."""
 
 
 NEVER = Ended()
