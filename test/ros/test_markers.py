@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 from builtin_interfaces.msg import Duration
 from rclpy.serialization import deserialize_message, serialize_message
 from robots import mixed, plan_of, random_configurations
@@ -12,7 +13,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from calib_planner import Robot
 from calib_planner.design.plan import Plan
 from calib_planner.errors import InputError
+from calib_planner.robot.catalogue import config_folder
 from calib_planner.ros.markers import MOST_SHOWN, plan_markers, skeletons
+from calib_planner.ros.settings import PlannerParameters
 from calib_planner.ros.trajectory import pace_of, trajectory_message
 
 STAMP = 1_500_000_000
@@ -86,6 +89,16 @@ def test_a_large_plan_is_a_bounded_picture() -> None:
 def test_one_configuration_has_no_path(robot: Robot) -> None:
     found = by_name(plan_markers(planned(robot, 1), robot, STAMP, "base"))
     assert "path" not in found and {"robot", "targets", "order"} <= set(found)
+
+
+def test_rviz_shows_what_the_node_publishes() -> None:
+    config = yaml.safe_load((config_folder() / "rviz" / "planner.rviz").read_text())["Visualization Manager"]
+    (display,) = [d for d in config["Displays"] if d["Class"] == "rviz_default_plugins/MarkerArray"]
+    topic = display["Topic"]
+    assert topic["Value"] == "/calibration_planner/markers" and display["Enabled"]
+    # A volatile reader would not get the latched markers of a plan made before RViz was started.
+    assert (topic["Durability Policy"], topic["Reliability Policy"]) == ("Transient Local", "Reliable")
+    assert config["Global Options"]["Fixed Frame"] == PlannerParameters().frame_id
 
 
 # ── trajectory ───────────────────────────────────────────────────────────────────────────────────────
