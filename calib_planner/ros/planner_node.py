@@ -176,9 +176,9 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         self, response: PlanService.Response | PlanAction.Result, result: Answer
     ) -> PlanService.Response | PlanAction.Result:
         """Put the answer into a response, and publish its plan."""
-        # A search that the service's node ends itself is no outcome the service has a word for.
-        known = hasattr(type(response), result.status)
-        response.status = getattr(type(response), result.status if known else "NOT_READY")
+        if not hasattr(type(response), result.status):  # the service has no cancel: the node itself stopped
+            result = Answer("NOT_READY", "", "the node was deactivated while it planned: activate it, ask again")
+        response.status = getattr(type(response), result.status)
         response.field, response.message = result.field, result.message
         if result.plan is None or result.model is None:
             response.plan = PlanMessage(status=PlanMessage.STATUS_EMPTY)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from bench import Bench
 from lifecycle_msgs.msg import State, Transition
-from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from lifecycle_msgs.srv import GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
@@ -69,8 +69,7 @@ class Small(ManagedNode[SmallParameters]):
 
 
 def change(bench: Bench, which: int, label: str = "") -> bool:
-    request = ChangeState.Request(transition=Transition(id=which, label=label))
-    return bool(bench.call(ChangeState, "small/change_state", request).success)
+    return bench.change_state("small", which, label)
 
 
 def endpoints(node: Small) -> int:

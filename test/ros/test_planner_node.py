@@ -15,7 +15,6 @@ from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -118,8 +117,7 @@ def test_while_it_plans_it_answers_and_can_be_cancelled(bench: Bench) -> None:
 
 
 def change(bench: Bench, which: int) -> bool:
-    request = ChangeState.Request(transition=Transition(id=which))
-    return bool(bench.call(ChangeState, "calibration_planner/change_state", request).success)
+    return bench.change_state("calibration_planner", which)
 
 
 def test_inactive_it_says_so_and_activated_it_plans(bench: Bench) -> None:
