@@ -1,4 +1,7 @@
-"""Nodes as processes of their own, on a ROS domain of their own, that are always ended."""
+"""Nodes as processes of their own, on a ROS domain of their own, that are always ended.
+
+They end with this process even if it is killed: see ``child``.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,7 @@ class Nodes:
 
     def start(self, module: str, parameters: Mapping[str, object] | None = None) -> None:
         """Start ``calib_planner.ros.MODULE`` with node parameters."""
-        command = [sys.executable, "-m", f"calib_planner.ros.{module}", "--ros-args"]
+        command = [sys.executable, "-m", "calib_planner.ros.child", module, "--ros-args"]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={value}"]
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +77,7 @@ class Nodes:
         with log.open("wb") as sink:
             process = subprocess.Popen(
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # closed by the system when this process ends, however it does
                 stdout=sink,
                 stderr=subprocess.STDOUT,
                 env=self._environment,
@@ -105,6 +108,9 @@ class Nodes:
             except subprocess.TimeoutExpired:
                 child.process.kill()
                 child.process.wait()
+        for child in self._children:
+            if child.process.stdin is not None:
+                child.process.stdin.close()
         return {c.name: int(c.process.returncode) for c in self._children}
 
     def logs(self) -> dict[str, str]:

@@ -1,0 +1,44 @@
+"""``python -m calib_planner.ros.child MODULE …``: a node that ends when whoever started it is no more.
+
+The parent holds the other end of this process's standard input and never writes to it. However the parent ends,
+by ``kill -9`` too, the system closes that end: then the node is told to end as Ctrl-C would tell it, and one that
+does not is ended. ``processes.Nodes`` starts nodes like this.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import signal
+import sys
+import threading
+import time
+
+PATIENCE = 8.0
+"""Time that the node has to end by itself [s]."""
+
+
+def end_with_parent() -> None:
+    """Watch standard input from now on."""
+    threading.Thread(target=_watch, daemon=True, name="parent").start()
+
+
+def _watch() -> None:
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(PATIENCE)
+    os._exit(1)
+
+
+def main() -> None:
+    """Run the module ``calib_planner.ros.MODULE`` with what follows on the command line."""
+    if len(sys.argv) < 2 or not sys.argv[1].isidentifier():
+        raise SystemExit("usage: python -m calib_planner.ros.child MODULE [--ros-args …]")
+    end_with_parent()
+    module = sys.argv.pop(1)
+    runpy.run_module(f"calib_planner.ros.{module}", run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

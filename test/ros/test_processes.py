@@ -1,0 +1,82 @@
+"""Nodes as processes: they end when told to, with status 0, and with the process that started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from calib_planner.ros.processes import Nodes, node_names, own_domain
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from calib_planner.ros.processes import Nodes
+
+nodes = Nodes(Path(sys.argv[1]), int(sys.argv[2]))
+for module in sys.argv[3:]:
+    nodes.start(module)
+print(*(c.process.pid for c in nodes._children), flush=True)
+time.sleep(600)
+"""
+
+
+def running(pid: int) -> bool:
+    """Whether a process is at work; one that only waits to be collected is not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def wait(condition: Callable[[], bool], seconds: float = 40.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return condition()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes by /proc")
+def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    names = node_names()
+    command = [sys.executable, "-c", PARENT, str(tmp_path), str(own_domain()), *names]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pids = [int(word) for word in parent.stdout.readline().split()]
+        try:
+            logs = [tmp_path / f"{name}.log" for name in names]
+            assert len(pids) == len(names) and wait(lambda: all(log.stat().st_size for log in logs))
+            assert all(running(pid) for pid in pids), [log.read_text() for log in logs]
+            parent.kill()
+            assert wait(lambda: not any(running(pid) for pid in pids))
+        finally:
+            parent.kill()
+            for pid in filter(running, pids):
+                os.kill(pid, signal.SIGKILL)
+    for log in logs:
+        assert "Traceback" not in log.read_text(), log.read_text()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
+    with Nodes(tmp_path, own_domain()) as nodes:
+        for name in node_names():
+            nodes.start(name)
+        logs = [tmp_path / f"{name}.log" for name in node_names()]
+        assert wait(lambda: all(log.stat().st_size for log in logs))
+        nodes.check()
+        assert nodes.end(number) == dict.fromkeys(node_names(), 0), nodes.logs()
+    for log in logs:
+        assert "Traceback" not in log.read_text(), log.read_text()
+
+
+def test_a_module_that_is_none_is_refused() -> None:
+    command = [sys.executable, "-m", "calib_planner.ros.child", "../planner_node"]
+    ended = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    assert ended.returncode == 1 and "usage" in ended.stderr and "Traceback" not in ended.stderr
