@@ -1,22 +1,36 @@
-"""Launch files: they compile and name what exists; with launch installed they also describe it."""
+"""Launch files: they name what exists, explain every argument and start our nodes only.
+
+launch is not among the PyPI wheels: where it is missing, ``Recorded`` stands in for everything of it and keeps what
+it was made with.
+"""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
 import re
+import sys
+from dataclasses import fields
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
 from calib_planner.robot.catalogue import config_folder
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.planner_node import PlannerNode
+from calib_planner.ros.settings import IdentifierParameters, PlannerParameters, SimulatorParameters
 from calib_planner.ros.simulator_node import SimulatorNode
 
 FOLDER = config_folder().parent / "launch"
 FILES = sorted(FOLDER.glob("*.launch.py"))
-NAMES = {"calibration_planner", "calibration_identifier", "tracker_simulator"}
+NODES: dict[str, tuple[str, type]] = {
+    "planner": ("calibration_planner", PlannerParameters),
+    "identifier": ("calibration_identifier", IdentifierParameters),
+    "simulator": ("tracker_simulator", SimulatorParameters),
+}
+NAMES = {name for name, _ in NODES.values()}
 
 
 def test_all_are_there() -> None:
@@ -40,8 +54,109 @@ def test_it_compiles_and_names_what_exists(path: Path) -> None:
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)
 def test_it_describes_nodes(path: Path) -> None:
     pytest.importorskip("launch_ros", reason="launch is not among the PyPI wheels")
+    assert load(path).generate_launch_description().entities
+
+
+class Recorded:
+    """Stands for any class of launch."""
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        self.args, self.named = args, named
+
+
+class Argument(Recorded):
+    """A declared argument."""
+
+    @property
+    def name(self) -> str:
+        return str(self.args[0])
+
+
+class Started(Recorded):
+    """A node."""
+
+
+class Value(Recorded):
+    """A LaunchConfiguration; given are the defaults."""
+
+    def perform(self, context: Any) -> str:
+        return str(context.defaults[self.args[0]])
+
+
+def load(path: Path) -> Any:
     spec = importlib.util.spec_from_file_location("launched", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    assert module.generate_launch_description().entities
+    return module
+
+
+@pytest.fixture
+def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
+    special = {"DeclareLaunchArgument": Argument, "Node": Started, "LaunchConfiguration": Value}
+    for name in ("actions", "conditions", "substitutions", "parameter_descriptions"):
+        for package in ("launch", "launch_ros"):
+            module: Any = ModuleType(f"{package}.{name}")
+            module.__getattr__ = lambda attribute: special.get(attribute, Recorded)
+            monkeypatch.setitem(sys.modules, f"{package}.{name}", module)
+    root: Any = ModuleType("launch")
+    root.__getattr__ = lambda attribute: Recorded
+    monkeypatch.setitem(sys.modules, "launch", root)
+    monkeypatch.setitem(sys.modules, "launch_ros", ModuleType("launch_ros"))
+
+
+def described(path: Path) -> tuple[dict[str, Argument], list[Started]]:
+    """Arguments by name and nodes, those of opaque functions with the arguments' defaults."""
+    entities = load(path).generate_launch_description().args[0]
+    arguments = {e.name: e for e in entities if isinstance(e, Argument)}
+    context = SimpleNamespace(defaults={n: a.named["default_value"] for n, a in arguments.items()})
+    nodes = [e for e in entities if isinstance(e, Started)]
+    for entity in entities:
+        if "function" in getattr(entity, "named", {}):
+            nodes += entity.named["function"](context, *entity.named["args"])
+    return arguments, nodes
+
+
+def used(thing: Any) -> set[str]:
+    """Names of the arguments that something is made of."""
+    if isinstance(thing, Value):
+        return {str(thing.args[0])}
+    if isinstance(thing, Recorded):
+        return used([*thing.args, *thing.named.values()])
+    parts = thing.values() if isinstance(thing, dict) else thing if isinstance(thing, (list, tuple)) else ()
+    return {name for part in parts for name in used(part)}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)
+def test_arguments_are_explained_and_used(path: Path, stand_ins: None) -> None:
+    arguments, nodes = described(path)
+    assert {"namespace"} <= set(arguments)
+    for name, argument in arguments.items():
+        assert len(argument.named["description"]) > 8, name
+        choices = argument.named.get("choices")
+        assert choices is None or argument.named["default_value"] in choices, name
+    mentioned = used(nodes)
+    assert mentioned <= set(arguments)
+    opaque = set(getattr(load(path), "KINDS", ())) | {"use_sim_time"}
+    assert set(arguments) - mentioned <= opaque
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)
+def test_nodes_are_ours_with_parameters_they_have(path: Path, stand_ins: None) -> None:
+    _, nodes = described(path)
+    ours = {n.named["executable"]: n for n in nodes if n.named["package"] == "calib_planner"}
+    assert ours
+    for executable, node in ours.items():
+        part = executable.removesuffix("_node")
+        assert node.named["name"] == NODES[part][0]
+        known = {f.name for f in fields(NODES[part][1])} | {"use_sim_time"}
+        for parameters in node.named["parameters"]:
+            assert not isinstance(parameters, dict) or set(parameters) <= known
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)
+def test_rviz_is_asked_for(path: Path, stand_ins: None) -> None:
+    arguments, nodes = described(path)
+    for node in (n for n in nodes if n.named["package"] != "calib_planner"):
+        assert node.named["package"] == "rviz2" and used(node.named["condition"]) == {"rviz"}
+        assert arguments["rviz"].named["default_value"] == "false"

@@ -1,0 +1,114 @@
+"""package.xml, setup.py and the linters' configuration say what the code needs and offers."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "calib_planner"
+ROS = {
+    *("rclpy", "ament_index_python", "launch", "launch_ros", "action_msgs", "builtin_interfaces"),
+    *(
+        "calib_planner_msgs",
+        "diagnostic_msgs",
+        "geometry_msgs",
+        "lifecycle_msgs",
+        "rcl_interfaces",
+        "sensor_msgs",
+    ),
+    *("std_msgs", "std_srvs", "trajectory_msgs", "unique_identifier_msgs", "visualization_msgs"),
+}
+"""Packages of ROS 2 Jazzy: they are keys by their own names."""
+KEYS = {
+    "numpy": "python3-numpy",
+    "scipy": "python3-scipy",
+    "yaml": "python3-yaml",
+    "matplotlib": "python3-matplotlib",
+    "rich": "python3-rich",
+    "jinja2": "python3-jinja2",
+    "markupsafe": "python3-jinja2",  # which needs it
+}
+"""Modules and their keys in rosdep's python.yaml that apt has on Ubuntu 24.04."""
+TEST_KEYS = {"ament_flake8", "python3-hypothesis", "python3-pytest", "python3-pytest-timeout"}
+EXTRAS = {"rosbags", "pinocchio", "dask", "distributed"}
+"""Without an apt package: nothing needs them, and they are not in package.xml."""
+
+
+def keys(kind: str) -> list[str]:
+    return [e.text or "" for e in ET.parse(ROOT / "package.xml").getroot().iter(kind)]
+
+
+def imported(folder: Path) -> set[str]:
+    """Top-level names of the modules that are imported anywhere below a folder."""
+    found: set[str] = set()
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {name.name.split(".")[0] for name in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                found.add((node.module or "").split(".")[0])
+    return found - set(sys.stdlib_module_names) - {"calib_planner"}
+
+
+def setup_call() -> dict[str, Any]:
+    """The keywords of ``setup(…)`` that are literals."""
+    tree = ast.parse((ROOT / "setup.py").read_text())
+    call = next(n for n in ast.walk(tree) if isinstance(n, ast.Call) and ast.unparse(n.func) == "setup")
+    literal: dict[str, Any] = {}
+    for keyword in call.keywords:
+        try:
+            literal[keyword.arg or ""] = ast.literal_eval(keyword.value)
+        except ValueError:
+            continue
+    return literal
+
+
+def test_package_xml_names_all_that_is_imported_and_nothing_else() -> None:
+    needed = imported(PACKAGE) | imported(ROOT / "launch")
+    assert needed <= ROS | set(KEYS) | EXTRAS, "unknown: find its rosdep key, or make it an extra"
+    assert set(keys("exec_depend")) == {KEYS.get(name, name) for name in needed - EXTRAS}
+
+
+def test_every_key_is_one_of_rosdep() -> None:
+    every = [k for kind in ("depend", "build_depend", "exec_depend", "test_depend") for k in keys(kind)]
+    assert len(set(every)) == len(every)
+    assert set(every) <= ROS | set(KEYS.values()) | TEST_KEYS
+    assert not any(key.endswith("-pip") for key in every)
+
+
+def test_setup_py_and_package_xml_agree() -> None:
+    call, root = setup_call(), ET.parse(ROOT / "package.xml").getroot()
+    names = {"PyYAML": "yaml", "Jinja2": "jinja2"}
+    required = [text.split(">")[0] for text in call["install_requires"]]
+    assert {KEYS[names.get(n, n)] for n in required} == {
+        k for k in keys("exec_depend") if k.startswith("python3-")
+    }
+    assert (call["version"], call["license"]) == (root.findtext("version"), root.findtext("license"))
+    maintainer = root.find("maintainer")
+    assert maintainer is not None and maintainer.get("email") == call["maintainer_email"]
+    assert "pytest" in call["extras_require"]["test"], "by this colcon test runs pytest"
+
+
+def test_every_node_is_an_executable() -> None:
+    scripts = dict(text.split(" = ") for text in setup_call()["entry_points"]["console_scripts"])
+    nodes = {p.stem: f"calib_planner.ros.{p.stem}:main" for p in (PACKAGE / "ros").glob("*_node.py")}
+    assert {k: v for k, v in scripts.items() if k.endswith("_node")} == nodes
+    for target in scripts.values():
+        module, _, function = target.partition(":")
+        path = ROOT / module.replace(".", "/")
+        text = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+        assert function in {n.name for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)} or (
+            f"import {function}" in text
+        ), target
+
+
+def test_ament_flake8() -> None:
+    main = pytest.importorskip("ament_flake8.main", reason="comes with ROS from apt").main
+    folders = [str(ROOT / name) for name in ("calib_planner", "launch", "test", "setup.py")]
+    assert main(argv=["--config", str(ROOT / "setup.cfg"), *folders]) == 0
