@@ -1,7 +1,6 @@
 """Launch files: they name what exists, explain every argument and start our nodes only.
 
-launch is not among the PyPI wheels: where it is missing, ``Recorded`` stands in for everything of it and keeps what
-it was made with.
+launch is not among the PyPI wheels: ``Recorded`` stands in for everything of it, and keeps what it was made with.
 """
 
 from __future__ import annotations
