@@ -8,9 +8,9 @@ and taken in by ``decided`` whenever it is ready; events that came meanwhile are
              (a batch)                                (outcome)          (validation)            (verdict)
 
 *Visits* wait in a queue in the order of travel. A measurement takes its visit out; a failed attempt leaves it
-there until the configuration's attempts are used up; a configuration given up leaves with all its visits and those
-in its neighbourhood, and when the batch is through the rest is planned around it. A measurement that is withdrawn
-(found to be an outlier, undone) puts its visit back. Pausing changes nothing but the next action.
+there until the configuration's attempts are used up; a configuration given up leaves with all its visits and with
+those in its neighbourhood, and when the batch is through the rest is planned around it. A measurement that is
+withdrawn (found to be an outlier, undone) puts its visit back. Pausing changes nothing but the next action.
 
 The measurements are all that cannot be made again: ``from_measurements`` begins where they end.
 """

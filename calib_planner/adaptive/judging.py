@@ -66,7 +66,7 @@ def forecast(found: Finding, required: float) -> float:
     if not np.isfinite(total).all() or (room <= 0).any():
         return float("inf")
     more = len(found.used) * (np.maximum(total**2 - floor**2, 0.0) / room - 1.0)
-    return float(max(np.ceil(more.max() - 1e-9), 0.0))
+    return max(float(np.ceil(more.max() - 1e-9)), 0.0) + 0.0
 
 
 def _forecast_text(state: CampaignState, found: Finding | None) -> str:

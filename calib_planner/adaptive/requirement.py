@@ -20,7 +20,7 @@ from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import DOUBT
 from calib_planner.identification.robust import normalised
-from calib_planner.identification.verdict import LEVELS, Reason, Verdict, mm
+from calib_planner.identification.verdict import LEVELS, Reason, Verdict, counted, mm
 from calib_planner.instrument.noise import Noise
 
 
@@ -76,9 +76,8 @@ def _achieved(estimate: Estimate, required: float, data: Measurements) -> Reason
     noise = 3.0 * estimate.noise.measurement**2
     error = float(np.sqrt(max(square - noise * (1.0 + 2.0 * np.sqrt(2.0 / (3.0 * len(residuals)))), 0.0)))
     level = "PASS" if error <= required else "FAIL"
-    text = (
-        f"achieved at the test poses, {len(residuals)} points: {mm(np.sqrt(square))} with the tracker's noise of "
-        f"{mm(np.sqrt(noise))}, {mm(required)} required"
-    )
+    points, rms, tracker = counted(len(residuals), "point"), float(np.sqrt(square)), float(np.sqrt(noise))
+    text = f"achieved at the test poses, {points}: {mm(rms)} with the tracker's noise of {mm(tracker)}"
+    text += f", {mm(required)} required"
     advice = "" if level == "PASS" else "something differs there: load, temperature, approach, the target's seat"
     return Reason(level, "achieved_at_test_poses", text, advice)

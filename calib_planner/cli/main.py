@@ -15,11 +15,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_planner import __version__
-from calib_planner.cli import compare, compensate, demo, identify, plan, reproduce, robots, sheet, simulate
+from calib_planner.cli import (
+    campaign,
+    compare,
+    compensate,
+    demo,
+    identify,
+    plan,
+    reproduce,
+    robots,
+    sheet,
+    simulate,
+)
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
 
-COMMANDS = (plan, sheet, compare, identify, compensate, simulate, robots, demo, reproduce)
+COMMANDS = (plan, sheet, campaign, compare, identify, compensate, simulate, robots, demo, reproduce)
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, CLOSED_PIPE = 0, 1, 2, 130, 141
 
 EPILOG = """\

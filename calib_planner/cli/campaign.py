@@ -1,0 +1,240 @@
+"""``calib-planner campaign``: measure until it is accurate enough, by hand round by round or in simulation."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_planner._arrays import check_count, check_number
+from calib_planner.adaptive import CampaignProblem, CampaignResult, CampaignState, Finished, from_measurements
+from calib_planner.adaptive.campaign import FIT, VALIDATION
+from calib_planner.adaptive.decision import decide
+from calib_planner.adaptive.run import run_campaign
+from calib_planner.adaptive.simulated import simulated
+from calib_planner.cli.arguments import (
+    Commands,
+    add_command,
+    add_parameters,
+    add_robot,
+    add_seed,
+    add_test_poses,
+    choose_parameters,
+    load_robot,
+    test_poses,
+)
+from calib_planner.cli.campaign_table import show_next, show_result
+from calib_planner.cli.conditions import add_conditions, conditions
+from calib_planner.cli.terminal import Terminal
+from calib_planner.demo import independent_seeds
+from calib_planner.design.plan import plain
+from calib_planner.errors import InputError
+from calib_planner.files.configurations_csv import write_configurations
+from calib_planner.files.estimate_yaml import write_estimate
+from calib_planner.files.measurements_csv import read_measurements, write_measurements
+from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.problem import AUTOMATIC
+from calib_planner.identification.verdict import mm
+from calib_planner.robot.chain import Robot
+from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations
+
+DESCRIPTION = """Plan a batch, measure it, identify, plan the rest from what was measured, until the accuracy is
+reached, the budget is spent, or more measurements cannot help; then validate on configurations that took no part.
+
+By hand: run it, measure what it says (--next FILE), run it again with all that was measured (--measured FILE);
+when it asks for validation, measure that into a file of its own (--held-out FILE). In simulation: --simulate
+SEED."""
+EXAMPLE = """calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
+      --required-accuracy 15e-6 --budget 40 --simulate 1
+  calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
+      --required-accuracy 15e-6 --measured points.csv --next next.csv"""
+DEFAULTS = {name: field.default for name, field in CampaignProblem.__dataclass_fields__.items()}
+NUMBERS = {
+    "budget": "measurements allowed in all",
+    "batch": "configurations planned at a time",
+    "validation": "of the budget, measurements that take no part in the fit",
+    "minimum": "fewest different configurations, however accurate they look",
+}
+
+
+def add(commands: Commands) -> None:
+    """Add the command's parser."""
+    summary = "plan, measure and identify until it is accurate enough"
+    parser = add_command(commands, "campaign", summary, run, EXAMPLE, DESCRIPTION)
+    add_robot(parser)
+    add_parameters(parser)
+    wanted = parser.add_argument_group("what is wanted")
+    add_test_poses(wanted, "where accuracy matters")
+    wanted.add_argument(
+        "--test-path", metavar="FILE", help="CSV with a column per joint; every row is a test pose"
+    )
+    wanted.add_argument(
+        "--required-accuracy", type=float, required=True, metavar="A", help="largest error at a test pose [m]"
+    )
+    work = parser.add_argument_group("what may be measured")
+    for name, text in NUMBERS.items():
+        work.add_argument(f"--{name}", type=int, default=DEFAULTS[name], metavar="N",
+                          help=f"{text} ({DEFAULTS[name]})")  # fmt: skip
+    add_conditions(work)
+    work.add_argument(
+        "--joint-corrections",
+        choices=AUTOMATIC,
+        default="auto",
+        help="auto: errors of the joints' transmissions are learnt where the data show them; off: never (auto)",
+    )
+    hand = parser.add_argument_group("by hand")
+    hand.add_argument("--measured", metavar="FILE", help="CSV of what was measured for the fit so far")
+    hand.add_argument("--held-out", metavar="FILE", help="CSV of what was measured for validation")
+    hand.add_argument("--next", metavar="FILE", help="write what to measure next: .csv with repetitions")
+    play = parser.add_argument_group("in simulation")
+    play.add_argument("--simulate", type=int, metavar="SEED", help="measure a simulated robot with hidden errors")
+    play.add_argument(
+        "--simulate-sigma", type=float, metavar="S", help="its tracker's true std of one coordinate [m] (--sigma)"
+    )
+    play.add_argument(
+        "--simulate-transmission", type=float, default=0.0, metavar="S", help="its joints err, rms [rad] (0)"
+    )
+    parser.add_argument("--output", metavar="DIR", help="folder for measurements, validation and estimate")
+    starts = DEFAULTS["starts"]
+    parser.add_argument("--starts", type=int, default=starts, metavar="N", help=f"random starts ({starts})")
+    add_seed(parser)
+
+
+def run(args: argparse.Namespace, terminal: Terminal) -> None:
+    """Do the work."""
+    _check(args)
+    robot = choose_parameters(load_robot(args), args)
+    problem = _problem(args, robot)
+    if args.simulate is None:
+        _by_hand(args, problem, terminal)
+    else:
+        _simulated(args, problem, terminal)
+
+
+def _check(args: argparse.Namespace) -> None:
+    by_hand = [o for o in ("measured", "held_out", "next") if getattr(args, o) is not None]
+    if args.simulate is not None and by_hand:
+        option = f"--{by_hand[0].replace('_', '-')}"
+        raise InputError(option, "with --simulate", "one of the two", "a simulated campaign measures by itself")
+    if args.simulate is None and args.simulate_sigma is not None:
+        raise InputError("--simulate-sigma", "without --simulate", "--simulate SEED beside it")
+    if args.held_out is not None and args.measured is None:
+        raise InputError("--held-out", "without --measured", "--measured FILE beside it")
+    if args.next is not None and not args.next.lower().endswith(".csv"):
+        raise InputError("--next", repr(args.next), "a name that ends in .csv")
+
+
+def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
+    poses = test_poses(robot, args)
+    if poses is None:
+        wanted = f"{len(robot.joint_names)} numbers: {', '.join(robot.joint_names)}"
+        raise InputError("--test-pose", "none", wanted, "give --test-pose or --test-path")
+    return CampaignProblem(
+        robot,
+        poses,
+        args.required_accuracy,
+        **{name: getattr(args, name) for name in NUMBERS},
+        **conditions(args, robot),
+        identification={"joint_corrections": args.joint_corrections},
+        starts=args.starts,
+        seed=args.seed,
+    )
+
+
+# ── by hand ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _by_hand(args: argparse.Namespace, problem: CampaignProblem, terminal: Terminal) -> None:
+    """One round: what the measurements say, and what to measure next."""
+    state = from_measurements(problem, _read(args, problem, "measured"), _read(args, problem, "held_out"))
+    with terminal.working("identifying and planning"):
+        while not state.queue and not isinstance(state.action, Finished):
+            state = state.decided(decide(state))
+    action = state.action
+    if isinstance(action, Finished):
+        _answer(args, terminal, action.result, {})
+        return
+    numbers = list(dict.fromkeys(state.queue))
+    q = np.array([state.stops[i].q for i in numbers])
+    times = [state.queue.count(i) for i in numbers]
+    role = state.stops[numbers[0]].role
+    if args.next:
+        write_configurations(args.next, problem.robot.joint_names, q, times, field="--next")
+    result = {
+        "outcome": state.outcome or None,
+        "message": state.message,
+        "next": {
+            "role": role,
+            "joint_names": problem.robot.joint_names,
+            "configurations": q,
+            "repetitions": times,
+            "output": args.next,
+        },
+        "left": state.left,
+        "rounds": [vars(r) for r in state.rounds],
+        "required_accuracy": problem.required_accuracy,
+    }
+    terminal.answer(plain(result), partial(show_next, state, q, times))
+    if args.next:
+        target = "--held-out" if role == VALIDATION else "--measured"
+        terminal.note(f"What to measure next is in {args.next} (rad, m); then add it to the file of {target}")
+
+
+def _read(args: argparse.Namespace, problem: CampaignProblem, option: str) -> Measurements | None:
+    path = getattr(args, option)
+    return None if path is None else read_measurements(path, problem.robot, degrees=args.degrees).data
+
+
+# ── in simulation ────────────────────────────────────────────────────────────────────────────────────
+
+
+def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Terminal) -> None:
+    check_count("--simulate", args.simulate, low=0, high=2**63 - 1)
+    truth_seed, noise_seed = independent_seeds(args.simulate, 2)
+    sigma = args.sigma if args.simulate_sigma is None else args.simulate_sigma
+    check_number("--simulate-sigma", sigma, low=0, high=1, unit="m")
+    check_number("--simulate-transmission", args.simulate_transmission, low=0, high=0.1, unit="rad")
+    errors = random_deviations(problem.robot, truth_seed)
+    same = args.simulate_sigma is None and args.instrument is not None
+    cell = SimulatedCell(problem.robot, errors, sigma, problem.noise if same else None)
+    world = World(cell, Faults(transmission_error=args.simulate_transmission), truth_seed)
+    with terminal.progress("measuring") as update:
+
+        def watch(state: CampaignState) -> None:
+            accuracy = f", {mm(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
+            update(state.spent() / problem.budget, f"{len(state.of_role(FIT))} measured{accuracy}")
+
+        result = run_campaign(problem, simulated(world, noise_seed), watch)
+    poses = problem.test_pose_array
+    found: dict[str, Any] = {"seed": args.seed, "simulate": args.simulate, "true": errors}
+    if result.estimate is not None:
+        stand = Stand(poses, np.arange(len(poses)), np.full(len(poses), np.inf))
+        off = result.estimate.positions(poses) - world.targets(stand)
+        found["achieved_per_test_pose"] = np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1))
+    _answer(args, terminal, result, found)
+
+
+def _answer(args: argparse.Namespace, terminal: Terminal, result: CampaignResult, more: dict[str, Any]) -> None:
+    if args.output:
+        _write(Path(args.output).expanduser(), result)
+    achieved = more.get("achieved_per_test_pose")
+    answer = result.to_dict() | plain(more) | {"output": args.output}
+    terminal.answer(answer, partial(show_result, result, achieved))
+    if args.output:
+        terminal.note(f"Measurements and estimate are in {args.output}")
+
+
+def _write(folder: Path, result: CampaignResult) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--output", f"{folder} ({error.strerror})", "a folder that can be made") from None
+    if result.fit is not None:
+        write_measurements(folder / "measurements.csv", result.fit, "--output")
+    if result.validation is not None:
+        write_measurements(folder / "validation.csv", result.validation, "--output")
+    if result.estimate is not None:
+        write_estimate(folder / "estimate.yaml", result.estimate, "--output")

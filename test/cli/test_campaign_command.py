@@ -1,0 +1,121 @@
+"""``campaign`` as a user runs it: in simulation, by hand round by round, and refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib_planner import Robot
+from calib_planner.cli import main
+from calib_planner.files.configurations_csv import read_plan_csv
+from calib_planner.files.estimate_yaml import read_estimate
+from calib_planner.files.measurements_csv import read_measurements, write_measurements
+from calib_planner.identification.measurements import Measurements
+from calib_planner.simulation import SimulatedCell, random_deviations
+
+POSE = ["--test-pose", "0.17453 0.87266"]
+BASE = ["campaign", "--robot", "planar_2r", *POSE, "--required-accuracy", "12e-6", "--starts", "4"]
+KEYS = {"outcome", "message", "rounds", "verdict", "estimate", "measurements", "validation_measurements", "spent"}
+
+
+def call(capsys: Any, *argv: str) -> tuple[int, str, str]:
+    status = main(argv)
+    return status, *capsys.readouterr()
+
+
+def test_simulated(tmp_path: Path, capsys: Any) -> None:
+    status, out, err = call(capsys, *BASE, "--simulate", "3", "--json", "--output", str(tmp_path / "new"))
+    found = json.loads(out)
+    assert status == 0 and "new" in err and set(found) >= KEYS
+    assert found["outcome"] == "reached" and found["predicted_accuracy"] <= 12e-6
+    assert found["achieved_per_test_pose"][0] < 3 * found["predicted_accuracy"]
+    assert [r["number"] for r in found["rounds"]] == list(range(len(found["rounds"])))
+    robot = Robot.load("planar_2r")
+    fit = read_measurements(tmp_path / "new" / "measurements.csv", robot).data
+    held_out = read_measurements(tmp_path / "new" / "validation.csv", robot).data
+    assert len(fit) + len(held_out) == found["spent"] and len(held_out) == 6
+    np.testing.assert_array_equal(fit.p, found["measurements"]["points"])
+    values = [p["value"] for p in found["estimate"]["parameters"]]
+    assert read_estimate(tmp_path / "new" / "estimate.yaml").values.tolist() == values
+    again = json.loads(call(capsys, *BASE, "--simulate", "3", "--json")[1])
+    assert (
+        again["rounds"] == found["rounds"] and again["estimate"]["parameters"] == found["estimate"]["parameters"]
+    )
+
+
+def test_the_tables(capsys: Any) -> None:
+    status, out, err = call(capsys, *BASE, "--simulate", "1")
+    assert status == 0 and not err
+    assert out.startswith(("PASS: reached", "WARN: reached")) and "rounds" in out and "as stated" in out
+    assert "True error at the test poses" in out and "Validation on 6 points" in out
+
+
+def test_more_noise_than_stated_is_said(capsys: Any) -> None:
+    options = ("--simulate", "1", "--simulate-sigma", "9e-5", "--budget", "30")
+    status, out, _ = call(capsys, *BASE, *options)
+    assert status == 0 and out.startswith("FAIL: budget spent") and "noise, as repeated" in out
+
+
+def test_by_hand_until_it_is_done(tmp_path: Path, capsys: Any) -> None:
+    """The loop that a person goes through with files, against a simulated cell."""
+    robot = Robot.load("planar_2r")
+    cell = SimulatedCell(robot, random_deviations(robot, 8))
+    files = {role: tmp_path / f"{role}.csv" for role in ("fit", "validation")}
+    data: dict[str, Measurements] = {}
+    options: list[str] = []
+    for turn in range(20):
+        status, out, _ = call(capsys, *BASE, "--json", "--next", str(tmp_path / "next.csv"), *options)
+        found = json.loads(out)
+        assert status == 0
+        if "next" not in found:
+            break
+        q, times = read_plan_csv(tmp_path / "next.csv", robot)
+        assert found["next"]["repetitions"] == times.tolist()
+        new, role = cell.measure(q, times, seed=turn), found["next"]["role"]
+        before = data.get(role)
+        if before is not None:
+            points = np.concatenate([before.p, new.p])
+            new = Measurements(new.joint_names, np.concatenate([before.q, new.q]), points)
+        data[role] = new
+        write_measurements(files[role], data[role])
+        options = ["--measured", str(files["fit"])]
+        options += ["--held-out", str(files["validation"])] if "validation" in data else []
+    assert found["outcome"] == "reached" and found["predicted_accuracy"] <= 12e-6
+    assert len(data["validation"]) == 6 and found["verdict"]["level"] in ("PASS", "WARN")
+
+
+def test_the_next_batch_as_a_table(capsys: Any) -> None:
+    status, out, _ = call(capsys, *BASE)
+    assert status == 0 and "measure next" in out and "2×" in out and "measurements planned" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "named"),
+    [
+        (["--simulate", "-1"], 2, "--simulate"),
+        (["--simulate", "1", "--measured", "x.csv"], 2, "--measured"),
+        (["--simulate", "1", "--budget", "5"], 2, "budget"),
+        (["--simulate", "1", "--budget", "8"], 1, "budget"),
+        (["--simulate-sigma", "1e-5"], 2, "--simulate-sigma"),
+        (["--simulate", "1", "--simulate-sigma", "nan"], 2, "--simulate-sigma"),
+        (["--simulate", "1", "--simulate-transmission", "1"], 2, "--simulate-transmission"),
+        (["--held-out", "x.csv"], 2, "--held-out"),
+        (["--next", "x.txt"], 2, "--next"),
+        (["--measured", "/nowhere.csv"], 1, "/nowhere.csv"),
+        (["--simulate", "1", "--required-accuracy", "-1"], 2, "required_accuracy"),
+        (["--simulate", "1", "--output", "/proc/none"], 2, "--output"),
+    ],
+)
+def test_refused(options: list[str], status: int, named: str, capsys: Any) -> None:
+    found, out, err = call(capsys, *BASE, *options)
+    assert found == status and named in err and out == "" and len(err.splitlines()) == 1
+
+
+def test_a_test_pose_is_needed(capsys: Any) -> None:
+    argv = ["campaign", "--robot", "planar_2r", "--required-accuracy", "1e-5", "--simulate", "1"]
+    status, _, err = call(capsys, *argv)
+    assert status == 2 and "--test-pose" in err
