@@ -24,7 +24,7 @@ lint: setup ## ruff and mypy
 	@. ./env.sh && ruff check . && ruff format --check . && mypy
 
 bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (minutes; JSON to results/)
-	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot identification streaming; do \
+	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot identification coverage streaming; do \
 	  echo "== $$name"; python bench/$$name.py > results/$$name.json || exit 1; done
 
 clean: ## remove what was made: .venv, build, install, log, caches
