@@ -85,6 +85,11 @@ class Nodes:
             )
         self._children.append(_Child(module, process, log))
 
+    @property
+    def processes(self) -> dict[str, int]:
+        """Process id of each node."""
+        return {c.name: c.process.pid for c in self._children}
+
     def check(self) -> None:
         """Raise ``ProcessFailed`` if a node has ended."""
         for child in self._children:

@@ -22,7 +22,7 @@ from calib_planner.ros.processes import Nodes
 nodes = Nodes(Path(sys.argv[1]), int(sys.argv[2]))
 for module in sys.argv[3:]:
     nodes.start(module)
-print(*(c.process.pid for c in nodes._children), flush=True)
+print(*nodes.processes.values(), flush=True)
 time.sleep(600)
 """
 
