@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test docs lint bench clean
+.PHONY: help setup demo test docs lint bench soak clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -26,6 +26,9 @@ lint: setup ## ruff and mypy
 bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (minutes; JSON to results/)
 	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot identification coverage streaming; do \
 	  echo "== $$name"; python bench/$$name.py > results/$$name.json || exit 1; done
+
+soak: setup ## the identifier at 1 kHz for 10 minutes: none lost, memory flat (SOAK='--minutes 2'; JSON to results/)
+	@mkdir -p results; . ./env.sh && python bench/soak.py $(SOAK) > results/soak.json
 
 clean: ## remove what was made: .venv, build, install, log, caches
 	rm -rf .venv build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
