@@ -103,12 +103,12 @@ class IdentifierParameters(LifecycleParameters):
         "",
         "folder of the campaign: accepted is what is on its disk, and a restart goes on there; "
         "empty = in memory only, lost with the node",
-        at_configure=True,
+        read_only=True,
     )
     save_folder: str = parameter(
         "",
         "folder for ~/save and ~/report; empty = store_folder; without either saving is off",
-        at_configure=True,
+        read_only=True,
     )
     clock_offset: float = parameter(
         0.1,

@@ -136,8 +136,8 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             return self._execute(goal, result)
         except CalibPlannerError as error:
             goal.abort()
-            result.status, result.message = ExecutePlan.Result.INVALID_PLAN, str(error)
-            self.get_logger().warning(f"plan refused: {error}")
+            result.status, result.message = ExecutePlan.Result.INVALID_PLAN, str(error)[:1000]
+            self.get_logger().warning(f"plan refused: {result.message}")
             return result
         except Exception as error:
             if not self.context.ok():
