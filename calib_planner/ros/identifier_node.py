@@ -21,7 +21,6 @@ from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -40,7 +39,8 @@ from calib_planner.ros.identified_model import IdentifiedModel, first_model, hea
 from calib_planner.ros.identifier_output import IdentifierOutput
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.model_source import TOPIC
-from calib_planner.ros.qos import LATCHED, STREAM_IN
+from calib_planner.ros.polling import Stream, StreamPoller
+from calib_planner.ros.qos import LATCHED
 from calib_planner.ros.run import run
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.ros.streams import Intake
@@ -84,18 +84,16 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         chosen = self.settings.value
         joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
         self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
-        self._hear(0, JointState, JOINTS, self._on_joints)
+        streams = [Stream(JointState, JOINTS, self._on_joints, partial(self._on_lost, 0))]
         for k, topic in enumerate(chosen.tracker_topics):
-            self._hear(1 + k, PointStamped, topic, partial(self._on_point, k))
+            hear, lost = partial(self._on_point, k), partial(self._on_lost, 1 + k)
+            streams.append(Stream(PointStamped, topic, hear, lost))
+        StreamPoller(self, streams)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         self.create_timer(chosen.diagnostics_period, self._tick, clock=steady)
         self._update()
         ready = self._waiting if self._campaign is None else f"ready to identify {self._campaign.robot.name}"
         self.get_logger().info(ready)
-
-    def _hear(self, stream: int, kind: type, topic: str, callback: Callable[..., None]) -> None:
-        events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, stream))
-        self.create_subscription(kind, topic, callback, STREAM_IN, event_callbacks=events)
 
     # ── which robot, which campaign ──────────────────────────────────────────────────────────────────
 
@@ -203,9 +201,9 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         if self._intake is not None and (results := self._intake.point(target, message)):
             self._handle(results)
 
-    def _on_lost(self, stream: int, event: object) -> None:
+    def _on_lost(self, stream: int, count: int) -> None:
         if self._intake is not None:
-            self._intake.watches[stream].lost += getattr(event, "total_count_change", 0)
+            self._intake.watches[stream].lost += count
 
     # ── what goes out ────────────────────────────────────────────────────────────────────────────────
 

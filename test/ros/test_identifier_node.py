@@ -15,7 +15,8 @@ from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import UndoMeasurement
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
-from rclpy.lifecycle import TransitionCallbackReturn
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from robots import plan_of, random_configurations
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -290,16 +291,22 @@ def test_a_configured_again_node_goes_on(bench: Bench, robot: Robot, planned: Pl
     names = {p.name for p in tmp_path.iterdir()}
     assert {"estimate_p.yaml", "measurements_p.csv", "report_p.html"} <= names
     for transition in ("deactivate", "cleanup", "configure", "activate"):
-        assert getattr(shift.node, f"trigger_{transition}")() == TransitionCallbackReturn.SUCCESS
+        change(bench, transition)
     bench.wait(lambda: len(shift.estimates) > count)
     after = shift.estimates[-1]
     assert after.complete and after.plan_id == "p"
     assert np.allclose(after.value, before.value, rtol=0, atol=1e-12)
 
 
+def change(bench: Bench, transition: str) -> None:
+    """Have the only node make a transition, in its own thread."""
+    request = ChangeState.Request(transition=Transition(label=transition))
+    assert bench.call(ChangeState, f"{NAME}/change_state", request, 30.0, 1).success
+
+
 def test_services_of_a_node_that_is_not_active_say_so(bench: Bench) -> None:
-    node = bench.start(IdentifierNode, robot="planar_2r", autostart=False)
-    node.trigger_configure()
+    bench.start(IdentifierNode, robot="planar_2r", autostart=False)
+    change(bench, "configure")
     for name in ("reset", "undo", "save", "report"):
         answer = bench.call(Trigger, f"{NAME}/{name}", Trigger.Request())
         assert not answer.success and "inactive" in answer.message
@@ -311,7 +318,8 @@ def test_a_store_of_another_robot_is_refused(bench: Bench, robot: Robot, planned
     shift = Shift(bench, robot, store_folder=str(tmp_path))
     shift.announce(planned)
     shift.rest(planned.configurations[0])
-    shift.node.close()
+    change(bench, "deactivate")
+    change(bench, "cleanup")
     before = (tmp_path / FILE).read_bytes()
     other = bench.start(IdentifierNode, robot="kuka_kr270", store_folder=str(tmp_path))
     assert other.state == "unconfigured" and "planar_2r" in other.failure
@@ -394,7 +402,8 @@ def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
     descriptions.publish(String(data=ARM.replace("0.5 0 0", "0.6 0 0")))
     bench.wait(lambda: "refused" in shift.node._waiting)
     assert shift.node._campaign.nominal.name == "arm" and len(shift.node._campaign.kept) == 12
-    shift.node.close()
+    change(bench, "deactivate")
+    change(bench, "cleanup")
     again = bench.start(IdentifierNode, robot="", store_folder=str(tmp_path))
     assert again._campaign.nominal.joint_names == robot.joint_names and len(again._campaign.kept) == 12
 
