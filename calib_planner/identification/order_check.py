@@ -113,6 +113,8 @@ def check_order(
         InputError: ``order`` has another length or a value that is not finite.
     """
     kept = tuple(kept)
+    if not kept:
+        return ()
     std = np.sqrt(np.maximum(np.diag(covariance)[list(kept)], 1e-300))
     fit = _Fit.of(equations, deviations, kept, std, order)
     found = [d for d in (fit.drift(), fit.bump(), *fit.reseats()) if d is not None]
@@ -292,7 +294,7 @@ class _Fit:
         probability = float(self._probability(explained, rank)[0])
         if not np.isfinite(probability):
             return None
-        scale = np.sqrt(np.diag(square))
+        scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
         free = (square - absorbed.T @ absorbed) / np.outer(scale, scale)
         amounts = np.linalg.pinv(free, rcond=ABSORBED, hermitian=True) @ (along / scale) / scale
         moved = np.abs(np.linalg.lstsq(self.triangle, absorbed @ amounts, rcond=1e-12)[0]) / self.std

@@ -10,8 +10,6 @@ it did not. Points go and come back until the selection stands still. The gate i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -76,20 +74,9 @@ def robust_registration(robot: Robot, data: Measurements, *, base: bool, tool: b
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Points inside the gate and where the weighted fit ended.
-
-    Attributes:
-        use: (N, targets) bool.
-        deviations: (P,) [m | rad].
-    """
-
-    use: NDArray[np.bool_]
-    deviations: FloatArray
-
-
-def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, scale_known: bool) -> Selection:
+def select(
+    equations: Equations, kept: tuple[int, ...], start: FloatArray, *, scale_known: bool
+) -> NDArray[np.bool_]:
     """Which points to believe; ``equations`` whitened point by point, all measured points in use.
 
     Args:
@@ -125,39 +112,10 @@ def select(equations: Equations, kept: tuple[int, ...], start: FloatArray, *, sc
     squares = np.sum(equations.residuals(deviations)[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     use = equations.use.copy()
     use[equations.use] = squares <= scale * gate_of(count) ** 2
-    return Selection(use, deviations)
+    return use
 
 
-def residual_covariance(
-    total: FloatArray,
-    weights: FloatArray,
-    jacobian: FloatArray,
-    inverse: FloatArray,
-    parameters: FloatArray,
-    use: NDArray[np.bool_],
-) -> FloatArray:
-    """Covariance of each point's residual: (N, targets, 3, 3) [m²].
-
-    Args:
-        total: (N, targets, 3, 3) Σ of the points.
-        weights: (N, targets, 3, 3) W⁻¹ of the fit.
-        jacobian: (N, targets, 3, P).
-        inverse: (P, P) N⁻¹ of the fit.
-        parameters: (P, P) C of the estimate.
-        use: Whether a point took part: L(I − H)Lᵀ with Σ = LLᵀ and the hat matrix H of the whitened equations,
-            which is Σ − JCJᵀ where W = Σ⁻¹; else Σ + JCJᵀ.
-    """
-    jacobian = np.ascontiguousarray(jacobian)
-    rows = np.linalg.inv(np.linalg.cholesky(weights)) @ jacobian
-    # A point that alone determines a parameter has no residual variance: a floor keeps 0/0 at 0.
-    left = (1.0 + 1e-6) * np.eye(3) - _spread(rows, inverse)
-    lower = np.linalg.cholesky(total)
-    inside = lower @ left @ np.swapaxes(lower, 2, 3)
-    outside = total + _spread(jacobian, parameters)
-    return np.where(use[:, :, None, None], inside, outside)
-
-
-def _spread(rows: FloatArray, matrix: FloatArray) -> FloatArray:
+def spread(rows: FloatArray, matrix: FloatArray) -> FloatArray:
     """J C Jᵀ of each block of rows (N, targets, 3, P), the first product of all at once."""
     half = (rows.reshape(-1, rows.shape[3]) @ matrix).reshape(rows.shape)
     return np.asarray(half @ np.swapaxes(rows, 2, 3))

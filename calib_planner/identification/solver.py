@@ -34,7 +34,6 @@ from calib_planner.identification.registration import register
 from calib_planner.identification.robust import (
     gate_of,
     normalised,
-    residual_covariance,
     robust_registration,
     select,
 )
@@ -70,11 +69,14 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
     seen = problem.data.seen
     robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
     check_count(problem, seen)
+    use = _believed(problem, robot)
     # What is decided on the way is decided from nominal: no start can tip it.
-    work, first = without_unseen(Work.of(problem, robot), seen, None)
+    work, first = without_unseen(Work.of(problem, robot, use))
     if start is not None and problem.loss == "linear":
         first = work.start_values(start)
-    found = _robust(work, first) if problem.loss == "robust" else weigh(work, seen, first)
+    found = weigh(work, use, first)
+    if problem.loss == "robust":
+        found = _gated(work, found)
     found, starts, agreeing = _other_starts(work, found)
     structure = _structure(work, found)
     evidence = Evidence(
@@ -115,14 +117,21 @@ def start_robot(robot: Robot, data: Measurements, *, robust: bool = False) -> Ro
 # ── points come and go ───────────────────────────────────────────────────────────────────────────────
 
 
-def _robust(work: Work, first: FloatArray) -> Weighed:
-    """Select points, fit, and gate until the selection stands still."""
-    seen = work.problem.data.seen
+def _believed(problem: IdentificationProblem, robot: Robot) -> NDArray[np.bool_]:
+    """(N, targets) points to begin with: all of them, or those inside the gate of a fit that forgets far ones."""
+    seen = problem.data.seen
+    if problem.loss != "robust":
+        return seen
+    work, first = without_unseen(Work.of(problem, robot, seen))
     known = work.source != "residuals"
-    selection = select(work.equations(seen, work.instrument), work.kept, first, scale_known=known)
-    use = selection.use
-    check_count(work.problem, use)
-    found = weigh(work, use, selection.deviations)
+    use = select(work.equations(seen, work.instrument), work.kept, first, scale_known=known)
+    check_count(problem, use)
+    return use
+
+
+def _gated(work: Work, found: Weighed) -> Weighed:
+    """Points go and come back until the selection stands still."""
+    seen, use = work.problem.data.seen, found.equations.use
     for _ in range(MOST_GATES):
         distance = _normalised(work, found)
         with np.errstate(invalid="ignore"):
@@ -150,12 +159,7 @@ def _gate(found: Weighed) -> float:
 def _normalised(work: Work, found: Weighed) -> FloatArray:
     """(N, targets) length of each residual in standard deviations of what it should be."""
     data = work.problem.data
-    predicted, jacobian = work.robot.positions_and_jacobian(data.q, found.fit.deviations)
-    blocks = jacobian.reshape(*data.p.shape, -1)
-    covariance = residual_covariance(
-        found.total, found.weights, blocks, found.fit.covariance(), found.covariance, found.equations.use
-    )
-    return normalised(data.p - predicted, covariance)
+    return normalised(data.p - work.robot.positions(data.q, found.fit.deviations), found.residual_covariance())
 
 
 def check_count(problem: IdentificationProblem, use: NDArray[np.bool_]) -> None:
@@ -199,7 +203,11 @@ def _other_starts(work: Work, found: Weighed) -> tuple[Weighed, int, int]:
             best, agreeing = other, 0
         agreeing += int(abs(other.cost - best.cost) <= close)
     if best is not found.fit:
-        found = weigh(work, found.equations.use, best.deviations)
+        # The first start was one of those that ended elsewhere.
+        found, agreeing = (
+            weigh(work, found.equations.use, best.deviations),
+            min(agreeing, work.problem.starts - 1),
+        )
     return found, work.problem.starts, agreeing
 
 

@@ -33,6 +33,8 @@ from calib_planner.identification.noise_levels import (
     improbable,
     repeat_scatter,
 )
+from calib_planner.identification.problem import UNKNOWN_SIGMA
+from calib_planner.identification.robust import spread
 from calib_planner.identification.structure import SIGNIFICANT, residual_structure
 from calib_planner.identification.work import Work
 
@@ -49,11 +51,24 @@ class Weighed:
     equations: Equations
     fit: Fit
     levels: NoiseLevels
-    weights: FloatArray  # (N, targets, 3, 3) covariance that the equations were whitened with
     total: FloatArray  # (N, targets, 3, 3) Σ of each point, discrepancy included
+    cross: FloatArray  # (N, targets, 3, 3) covariance of each used point's prediction with its error
     covariance: FloatArray  # (P, P) cov(Π̂)
     chi_square: float  # of measurement noise alone
     freedom: int
+
+    def residual_covariance(self) -> FloatArray:
+        """(N, targets, 3, 3) of measured − predicted: Σ + JCJᵀ, and less its cross terms where a point took part.
+
+        With W = Σ⁻¹ the cross terms are JCJᵀ, and Σ − JCJᵀ is left.
+        """
+        rows = _rows(self.equations, self.fit)
+        known = bool(np.isfinite(self.covariance).all())
+        covariance = self.covariance if known else self.fit.covariance()
+        cross = self.cross + np.swapaxes(self.cross, 2, 3)
+        inside = np.where(self.equations.use[:, :, None, None], cross, 0.0)
+        # A point that alone determines a parameter has no residual variance: a floor keeps 0/0 at 0.
+        return (1.0 + 1e-6) * self.total + spread(rows, covariance) - inside
 
 
 def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
@@ -84,7 +99,9 @@ def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
         return _with_discrepancy(work, found, TINY * instrument) if apart else found
     cost = fit.cost
     levels = replace(levels, measurement=float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0)))
-    found = Weighed(equations, fit, levels, instrument, instrument, fit.covariance(), cost, freedom)
+    covariance = fit.covariance()
+    cross = spread(_rows(equations, fit), covariance)
+    found = Weighed(equations, fit, levels, instrument, cross, covariance, cost, freedom)
     told_by = repeats if source == "repetitions" else 0
     if work.problem.discrepancy == "off" or not improbable(cost, freedom, told_by) or seen <= len(work.kept):
         return found
@@ -100,7 +117,10 @@ def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels,
         factor = float(own @ own) / freedom if freedom > 0 else float("nan")
         if equations.prior is None or not np.isfinite(factor) or abs(factor - 1.0) < 1e-6:
             break
-        scale *= max(factor, 1e-12)
+        least = (LEAST_SCATTER / UNKNOWN_SIGMA) ** 2
+        if scale * factor < least:
+            break
+        scale *= factor
         equations = work.equations(equations.use, scale * instrument)
         fit = gauss_newton(equations, fit.deviations, work.kept, work.problem.iterations)
     unit = float(np.sqrt(instrument[0, 0, 0, 0]))
@@ -108,7 +128,8 @@ def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels,
     weights = scale * instrument
     total = (factor if np.isfinite(factor) else 1.0) * weights
     covariance = (factor if equations.prior is None else 1.0) * fit.covariance()
-    return Weighed(equations, fit, levels, weights, total, covariance, float("nan"), freedom)
+    cross = spread(_rows(equations, fit), covariance if np.isfinite(factor) else fit.covariance())
+    return Weighed(equations, fit, levels, total, cross, covariance, float("nan"), freedom)
 
 
 def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Weighed:
@@ -131,33 +152,38 @@ def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Wei
         measured = instrument + levels.measurement**2 * np.eye(3)
         left = np.where([n == "point" for n in model.names], 0.0, variances)
     levels = replace(levels, discrepancy=float(np.sqrt(model.mean_square(left))))
+    covariance, cross = _sandwich(equations, fit, model, variances, weights)
+    total = measured + levels.discrepancy_covariance(work.robot, data.q)
     return replace(
-        found,
-        equations=equations,
-        fit=fit,
-        levels=levels,
-        weights=weights,
-        total=measured + levels.discrepancy_covariance(work.robot, data.q),
-        covariance=_sandwich(equations, fit, model, variances, weights),
+        found, equations=equations, fit=fit, levels=levels, total=total, cross=cross, covariance=covariance
     )
 
 
 def _sandwich(
     equations: Equations, fit: Fit, model: DiscrepancyModel, variances: FloatArray, weights: FloatArray
-) -> FloatArray:
-    """N⁻¹ (JᵀWΣWJ + prior) N⁻¹ for W⁻¹ = ``weights`` (N, targets, 3, 3)."""
-    data, use, count = equations.data, equations.use, len(fit.deviations)
-    jacobian = equations.robot.jacobian(data.q, fit.deviations).reshape(*data.p.shape, -1)[use]
-    pulled = np.linalg.solve(weights[use], jacobian)
-    rows, _ = equations.prior_rows(fit.deviations)
-    middle = rows.T @ rows + np.einsum("kia,kij,kjb->ab", pulled, model.instrument, pulled, optimize=True)
-    flat = pulled.reshape(-1, count)
-    for variance, columns in zip(variances, model.columns, strict=True):
-        for index in model.blocks:
-            shared = np.swapaxes(columns[index], 1, 2) @ flat[index]
-            middle += variance * np.einsum("gka,gkb->ab", shared, shared, optimize=True)
-    inverse = fit.covariance()
-    return inverse @ middle @ inverse
+) -> tuple[FloatArray, FloatArray]:
+    """For W⁻¹ = ``weights``: N⁻¹ (JᵀWΣWJ + prior) N⁻¹, and JN⁻¹JᵀWΣ of each point with itself."""
+    use, inverse = equations.use, fit.covariance()
+    rows = _rows(equations, fit)
+    pulled = np.linalg.solve(weights[use], rows[use])
+    columns = np.hstack([np.sqrt(v) * c for v, c in zip(variances, model.columns, strict=True)])
+    # ΣWJ, block by block: the instrument's part of each point, and what the points of a configuration share.
+    mixed = (model.instrument @ pulled).reshape(len(columns), -1)
+    flat = pulled.reshape(mixed.shape)
+    for index in model.blocks:
+        part = columns[index]
+        mixed[index] += part @ (np.swapaxes(part, 1, 2) @ flat[index])
+    prior, _ = equations.prior_rows(fit.deviations)
+    covariance = inverse @ (flat.T @ mixed + prior.T @ prior) @ inverse
+    cross = np.zeros((*use.shape, 3, 3))
+    cross[use] = rows[use] @ inverse @ np.swapaxes(mixed.reshape(pulled.shape), 1, 2)
+    return covariance, cross
+
+
+def _rows(equations: Equations, fit: Fit) -> FloatArray:
+    """(N, targets, 3, P) ∂p/∂Π where the fit ended."""
+    jacobian = np.ascontiguousarray(equations.robot.jacobian(equations.data.q, fit.deviations))
+    return jacobian.reshape(*equations.data.p.shape, -1)
 
 
 def _targets_err_alike(work: Work, found: Weighed) -> bool:

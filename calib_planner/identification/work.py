@@ -28,6 +28,7 @@ class Work:
 
     problem: IdentificationProblem
     robot: Robot
+    use: NDArray[np.bool_]  # (N, targets) points that say what can be found
     instrument: FloatArray  # (N, targets, 3, 3); the identity where nothing is known
     source: str
     labels: IntArray
@@ -37,13 +38,14 @@ class Work:
     kept: tuple[int, ...]
 
     @staticmethod
-    def of(problem: IdentificationProblem, robot: Robot) -> Work:
+    def of(problem: IdentificationProblem, robot: Robot, use: NDArray[np.bool_]) -> Work:
+        """With the points ``use`` (N, targets) saying what can be found."""
         data, names = problem.data, robot.parameter_names
         instrument, source = problem.instrument_covariance()
         jacobian = robot.jacobian(data.q).reshape(*data.p.shape, -1)
-        found = analyse(jacobian[data.seen].reshape(-1, len(names)), names)
+        found = analyse(jacobian[use].reshape(-1, len(names)), names)
         labels, at = configuration_labels(data.q), np.zeros(len(names))
-        work = Work(problem, robot, instrument, source, labels, at, jacobian, found, found.kept)
+        work = Work(problem, robot, use, instrument, source, labels, at, jacobian, found, found.kept)
         return replace(work, kept=work._with_prior(work.unit, np.zeros(len(names))))
 
     @property
@@ -55,7 +57,7 @@ class Work:
     @property
     def unit(self) -> float:
         """Standard deviation of one coordinate that the instrument has [m]."""
-        return float(np.sqrt(np.mean(np.einsum("kii->ki", self.instrument[self.problem.data.seen]))))
+        return float(np.sqrt(np.mean(np.einsum("kii->ki", self.instrument[self.use]))))
 
     def seeing(self, deviations: FloatArray, lengths: FloatArray, sigma: float) -> Work:
         """The same with what can be seen at ``deviations`` in spite of coordinates that scatter ``sigma`` [m].
@@ -71,7 +73,7 @@ class Work:
         jacobian = self.robot.jacobian(data.q, deviations).reshape(*data.p.shape, -1)
         # What could not be told apart before stays held, though it may differ a little here.
         held = np.isin(np.arange(len(names)), self.identifiability.held)
-        rows = jacobian[data.seen].reshape(-1, len(names))
+        rows = jacobian[self.use].reshape(-1, len(names))
         found = analyse(rows, names, shortest=np.where(held, np.inf, shortest))
         there = replace(self, at=deviations, jacobian=jacobian, identifiability=found, kept=found.kept)
         held = ~np.isin(np.arange(len(names)), self.kept)
@@ -84,7 +86,7 @@ class Work:
             return self.identifiability.kept
         # A prior is worth as many metres of the points as their scatter leaves undecided.
         rows = sigma * prior.rows(names, np.zeros(len(names)))[0]
-        seen = self.jacobian[self.problem.data.seen].reshape(-1, len(names))
+        seen = self.jacobian[self.use].reshape(-1, len(names))
         return analyse(np.vstack([seen, rows]), names, shortest=shortest).kept
 
     def equations(self, use: NDArray[np.bool_], covariance: FloatArray) -> Equations:
@@ -102,13 +104,13 @@ class Work:
         return warm
 
 
-def without_unseen(work: Work, use: NDArray[np.bool_], start: Estimate | None) -> tuple[Work, FloatArray]:
+def without_unseen(work: Work) -> tuple[Work, FloatArray]:
     """What can be seen in spite of the scatter that a first fit leaves, and where that fit ended.
 
     Asked at the start, since a fit may run so far along what it cannot see that it seems to see it; and again
     where the fit ended, since a reflector on the last axis, say, is not there before it has been found.
     """
-    first = work.start_values(start)
+    first, use = np.zeros(len(work.robot.parameter_names)), work.use
     if work.problem.iterations <= FIRST_ITERATIONS:
         return work, first
     equations = work.equations(use, work.instrument)
