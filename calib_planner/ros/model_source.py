@@ -122,7 +122,7 @@ class ModelSource:
         Raises:
             CalibPlannerError: It is refused.
         """
-        if text == self._text:
+        if text and text == self._text:
             return None
         try:
             found = described_model(text, self._settings.base_link, self._settings.tip_link)
