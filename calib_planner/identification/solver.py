@@ -20,7 +20,7 @@ from calib_planner._arrays import FloatArray
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.evidence import Evidence, estimate_of
-from calib_planner.identification.least_squares import gauss_newton
+from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import improbable
 from calib_planner.identification.order_check import (
@@ -201,7 +201,7 @@ def _other_starts(work: Work, found: Weighed) -> tuple[Weighed, int, int]:
         other = gauss_newton(found.equations, first, found.fit.kept, work.problem.iterations, enough=same)
         if other.cost < best.cost - close and other.converged:
             best, agreeing = other, 0
-        agreeing += int(abs(other.cost - best.cost) <= close)
+        agreeing += int(abs(other.cost - best.cost) <= close and _same(other, best))
     if best is not found.fit:
         # The first start was one of those that ended elsewhere.
         found, agreeing = (
@@ -209,6 +209,13 @@ def _other_starts(work: Work, found: Weighed) -> tuple[Weighed, int, int]:
             min(agreeing, work.problem.starts - 1),
         )
     return found, work.problem.starts, agreeing
+
+
+def _same(one: Fit, other: Fit) -> bool:
+    """Whether two fits ended in one place: closer than a standard deviation in every parameter."""
+    kept = list(one.kept)
+    std = np.sqrt(np.diag(one.covariance())[kept])
+    return bool((np.abs(one.deviations - other.deviations)[kept] <= std).all())
 
 
 # ── do the residuals know where the robot stood, or when? ─────────────────────────────────────────────────────

@@ -40,6 +40,8 @@ from calib_planner.identification.work import Work
 
 LEAST_SCATTER = 1e-8
 """Repetitions that agree better than this are copies, and say nothing of the noise [m]."""
+LEAST_SPARE = 0.5
+"""Degrees of freedom below which residuals say nothing of the noise."""
 TINY = 1e-6
 """Share of the stand-in covariance that keeps matrices regular where the noise is estimated anew."""
 
@@ -114,7 +116,10 @@ def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels,
     # Without a prior the parameters do not depend on the scale; with one, both settle together.
     for _ in range(1 if equations.prior is None else 20):
         own = fit.residuals[: 3 * int(equations.use.sum())]
-        factor = float(own @ own) / freedom if freedom > 0 else float("nan")
+        prior, _ = equations.prior_rows(fit.deviations)
+        # Parameters that the prior decides cost the data no degree of freedom.
+        spare = len(own) - len(fit.kept) + float(np.trace(prior @ fit.covariance() @ prior.T))
+        factor = float(own @ own) / spare if freedom > 0 and spare > LEAST_SPARE else float("nan")
         if equations.prior is None or not np.isfinite(factor) or abs(factor - 1.0) < 1e-6:
             break
         least = (LEAST_SCATTER / UNKNOWN_SIGMA) ** 2
