@@ -29,6 +29,8 @@ WHAT = "a URDF"
 ATTRIBUTE = re.compile(rb"""\s+([^\s=/>"']+)\s*=\s*("[^"]*"|'[^']*')""")
 """One attribute; of a document that is well formed, which the parser has checked."""
 
+ROUNDING = 1e-15
+"""A number that changed by no more than this did not change [m | rad]."""
 AXIS_TOLERANCE = 1e-9
 X_AXIS = "1 0 0"
 """What URDF takes where no axis is given."""
@@ -210,7 +212,7 @@ def _replaced(old: str, value: FloatArray) -> str:
 
 def _says(text: str, value: FloatArray) -> bool:
     numbers = _numbers(text)
-    return numbers is not None and bool((numbers == value).all())
+    return numbers is not None and bool((np.abs(numbers - value) <= ROUNDING).all())
 
 
 def _unit(direction: FloatArray) -> FloatArray:
