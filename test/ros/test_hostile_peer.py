@@ -186,6 +186,7 @@ PLANS: dict[str, dict[str, Any]] = {
     "never": {"repetitions": [0] * 5},
     "another robot": {"robot": PATHS[0]},
     "100 000 parameters": {"parameters": [f"p{i}" for i in range(100_000)]},
+    "a long id": {"plan_id": "x" * BIG},
     "no status": {"status": 255},
     "sigma": {"sigma": float("nan")},
     "poses": {"test_poses": [float("inf")] * 10},
@@ -201,7 +202,7 @@ def test_plans(cell: Cell, planned: Plan, case: str) -> None:
     assert all(e.plan_id != "hostile" for e in cell.estimates)
     goal = ExecutePlan.Goal(plan=message)
     client = cell.bench.action(ExecutePlan, f"{SIMULATOR}/execute_plan")
-    if case in ("100 000 parameters", "sigma"):  # not what it executes
+    if case in ("a long id", "100 000 parameters", "sigma"):  # not what it executes
         goal.plan.robot = "other"
     result = cell.bench.future(cell.bench.goal(client, goal).get_result_async(), 30.0).result
     assert result.status == ExecutePlan.Result.INVALID_PLAN and 0 < len(result.message) < 3000
@@ -341,7 +342,7 @@ def test_no_peer_chooses_where_is_written(cell: Cell, name: str) -> None:
 # ── in the end ───────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("plan_id", [p for p in PATHS if "\0" not in p], ids=lambda p: ascii(p[:16]))
+@pytest.mark.parametrize("plan_id", [p[:500] for p in PATHS if "\0" not in p], ids=lambda p: ascii(p[:16]))
 def test_a_plan_is_measured_and_saved_whatever_its_name(cell: Cell, planned: Plan, plan_id: str) -> None:
     message = plan_to_message(planned, plan_id, 0, "base")
     cell.plans.publish(message)
