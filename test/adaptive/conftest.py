@@ -1,4 +1,4 @@
-"""Makes ``import cells`` work."""
+"""Makes ``import worlds`` work."""
 
 import sys
 from pathlib import Path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cells import POSE, SIGMA, achieved, campaign, kuka, planar, world_of
+from worlds import POSE, SIGMA, achieved, campaign, kuka, planar, world_of
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, UnknownNameError, identify
 from calib_planner.adaptive import CampaignProblem, Measure, begin, decide, run_campaign

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cells import SIGMA, planar, world_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worlds import SIGMA, planar, world_of
 
 from calib_planner import InputError, Measurements
 from calib_planner.adaptive import Finished, Measure, Paused, Replan, Validate, begin, decide, from_measurements
