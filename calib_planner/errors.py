@@ -99,7 +99,7 @@ class MissingExtraError(CalibPlannerError, ImportError):
 
 
 class StoreError(CalibPlannerError):
-    """Nothing can be written or read at the moment: a full disk, a folder that is not writable, a device in trouble.
+    """Nothing can be written or read now: a full disk, a folder that is not writable, a device in trouble.
 
     What is there is right; the same thing can be tried again later.
 
