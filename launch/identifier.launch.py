@@ -11,7 +11,7 @@ what differs; what there is, with units and ranges, is in config/identifier.yaml
 
     ros2 topic echo /calibration_identifier/measurements                    # accepted or rejected, and why
     ros2 topic echo --once /calibration_identifier/estimate
-    ros2 service call /calibration_identifier/undo std_srvs/srv/Trigger     # the newest; by id: ~/undo_measurement
+    ros2 service call /calibration_identifier/undo std_srvs/srv/Trigger    # the newest; by id: ~/undo_measurement
     ros2 service call /calibration_identifier/report std_srvs/srv/Trigger
 """
 
