@@ -269,3 +269,34 @@ def test_covariance_with_a_discrepancy_is_the_dense_sandwich():
     expected = inverse @ jacobian.T @ block_diag(*blocks) @ jacobian @ inverse
     std = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found.covariance / np.outer(std, std), expected / np.outer(std, std), atol=1e-3)
+
+
+@pytest.mark.parametrize("length", [0.3, 1.0])
+def test_std_is_right_though_configurations_share_the_errors_of_joints(length):
+    """A transmission error that is smooth in a joint's angle moves the parameters by more than a white one."""
+    squares = []
+    for seed in range(10):
+        robot = WrongRobot(seed, 3.5e-4, length, 1e-4)
+        data = robot.measure(random_configurations(robot.asked, 50, seed))
+        found = identify(IdentificationProblem(robot.asked, data, sigma=SIGMA, starts=0))
+        assert found.transmission is not None
+        truth = np.array([robot.cell.deviations[name] for name in found.parameters])
+        squares.append(np.mean(((found.deviations - truth) / found.std) ** 2))
+    error = max(np.std(squares), 0.5) / np.sqrt(len(squares))
+    assert np.mean(squares) == pytest.approx(1.0, abs=4 * error)
+    assert np.mean(squares) < 2.0
+
+
+def test_noise_told_by_repetitions_is_that_of_the_joint_corrections():
+    """Given by sigma or told by as many repetitions as need be, the complete model is nearly the same."""
+    robot = WrongRobot(4, 5e-4, 0.5, 2e-5)
+    data = robot.measure(random_configurations(robot.asked, 40, 4), 3)
+    given = identify(IdentificationProblem(robot.asked, data, sigma=SIGMA, starts=0))
+    told = identify(IdentificationProblem(robot.asked, data, starts=0))
+    assert told.noise.source == "repetitions"
+    assert told.noise.measurement == pytest.approx(SIGMA, rel=0.15)
+    assert told.transmission is not None and given.transmission is not None
+    assert told.transmission.gain == pytest.approx(given.transmission.gain, rel=0.1)
+    assert told.transmission.amplitude == pytest.approx(given.transmission.amplitude, rel=0.05)
+    q = random_configurations(robot.asked, 50, 5)
+    np.testing.assert_allclose(told.positions(q), given.positions(q), atol=1e-5)
