@@ -12,12 +12,18 @@ from typing import Any
 
 from calib_planner.robot.catalogue import config_folder
 from calib_planner.ros.parameters import constraints_text
-from calib_planner.ros.settings import IdentifierParameters, PlannerParameters, SimulatorParameters
+from calib_planner.ros.settings import (
+    CampaignParameters,
+    IdentifierParameters,
+    PlannerParameters,
+    SimulatorParameters,
+)
 
 NODES: dict[str, tuple[type[Any], str]] = {
     "planner": (PlannerParameters, "calibration_planner"),
     "identifier": (IdentifierParameters, "calibration_identifier"),
     "simulator": (SimulatorParameters, "tracker_simulator"),
+    "campaign": (CampaignParameters, "calibration_campaign"),
 }
 """Name of the file → the parameters and the node's name."""
 

@@ -1,4 +1,4 @@
-"""The parameters of the three nodes; ``config/*.yaml`` repeats them for users, a test keeps both equal."""
+"""The parameters of the nodes; ``config/*.yaml`` repeats them for users, a test keeps both equal."""
 
 from __future__ import annotations
 
@@ -223,6 +223,104 @@ class SimulatorParameters(LifecycleParameters, Faults):
                 raise InputError("true_deviations", word, "name=number with commas between")
             result[name.strip()] = value
         return result
+
+
+@dataclass(frozen=True)
+class CampaignParameters(LifecycleParameters):
+    """Parameters of ``calibration_campaign``; what is asked is taken when a campaign begins (~/start)."""
+
+    robot: str = parameter("kuka_kr270", ROBOT + "; empty = only robot_description", at_configure=True)
+    use_robot_description: bool = parameter(
+        True, "a URDF heard on robot_description replaces robot", at_configure=True
+    )
+    base_link: str = parameter(
+        "", "robot_description: first link of the chain; empty = the root", at_configure=True
+    )
+    tip_link: str = parameter("", "robot_description: last link; empty = the only tip", at_configure=True)
+    parameters: str = parameter("lengths+offsets", LEVEL)
+    unknown: str = parameter("", "what else is unknown: base, tool or base,tool")
+    targets: int = parameter(
+        0, "reflectors; 0 = as the robot has; others are at the tip, with unknown tool", low=0, high=100
+    )
+    test_poses: str = parameter(
+        "", "where accuracy matters: joint coordinates [rad | m] with spaces between, poses with semicolons"
+    )
+    required_accuracy: float = parameter(
+        1e-4, "largest root mean square error at a test pose that will do", unit="m", low=1e-9, high=1.0
+    )
+    budget: int = parameter(60, "measurements allowed in all, validation and failures too", low=2, high=10000)
+    batch: int = parameter(6, "configurations planned at a time", low=1, high=200)
+    validation: int = parameter(6, "measurements at the end that take no part in the fit", low=0, high=1000)
+    minimum: int = parameter(4, "fewest different configurations, however accurate they look", low=1, high=1000)
+    attempts: int = parameter(2, "tries at a configuration before it is given up", low=1, high=100)
+    most_failures: int = parameter(20, "configurations given up before the campaign ends", low=0, high=10000)
+    exclusion: float = parameter(
+        0.05,
+        "half width of what is given up with a configuration, share of each joint's range",
+        low=1e-4,
+        high=0.5,
+    )
+    sigma: float = parameter(
+        1e-5, "expected noise of one coordinate of one measurement", unit="m", low=1e-9, high=1.0
+    )
+    joint_corrections: str = parameter(
+        "auto", "errors of the joints' transmissions are learnt where the data show them", choices=("auto", "off")
+    )
+    constraints: str = parameter(
+        "", "what may be measured: a file in constraints_folder; empty = joint limits only"
+    )
+    constraints_folder: str = parameter("", "folder of constraints; empty = the package's config", read_only=True)
+    starts: int = parameter(16, "random starts of each plan's search", low=1, high=100000)
+    time_limit: float = parameter(60.0, "longest search of a plan", unit="s", low=0.01, high=86400.0)
+    seed: int = parameter(0, "seed of the plans", low=0, high=2**31 - 1)
+    store_folder: str = parameter(
+        "",
+        "folder of the campaign's journal and results: a restart goes on there; empty = lost with the node",
+        at_configure=True,
+    )
+    execute_action: str = parameter(
+        "tracker_simulator/execute_plan", "the robot: an ExecutePlan action", at_configure=True
+    )
+    identifier: str = parameter(
+        "calibration_identifier",
+        "name of the identifier, whose plan_topic is this node's ~/plan",
+        at_configure=True,
+    )
+    dwell: float = parameter(
+        0.0, "standing still per measurement; 0 = the robot's", unit="s", low=0.0, high=600.0
+    )
+    patience: float = parameter(
+        10.0, "after the robot stood, longest wait for the identifier's word", unit="s", low=0.1, high=3600.0
+    )
+    silence: float = parameter(
+        30.0, "longest time without a sign of life from the robot while it moves", unit="s", low=0.5, high=3600.0
+    )
+    longest_wait: float = parameter(
+        600.0, "a robot or identifier that is away this long pauses the campaign", unit="s", low=1.0, high=86400.0
+    )
+    frame_id: str = parameter("base_link", "frame of the robot's base")
+
+    def __post_init__(self) -> None:
+        for word in unknown_words(self.unknown):
+            if word not in ("base", "tool"):
+                raise UnknownNameError("unknown", word[:100], ("base", "tool"))
+        if self.budget <= self.validation:
+            raise InputError("budget", self.budget, f"more than validation, which is {self.validation}")
+        _ = self.test_pose_rows
+
+    @property
+    def test_pose_rows(self) -> tuple[tuple[float, ...], ...]:
+        """``test_poses`` as numbers, a row per pose."""
+        rows = []
+        for text in filter(None, (p.strip() for p in self.test_poses.split(";"))):
+            try:
+                row = tuple(float(word) for word in text.replace(",", " ").split())
+            except ValueError:
+                row = (float("nan"),)
+            if not np.isfinite(row).all():
+                raise InputError("test_poses", text[:100], "numbers with spaces between, poses with semicolons")
+            rows.append(row)
+        return tuple(rows)
 
 
 def unknown_words(text: str) -> list[str]:

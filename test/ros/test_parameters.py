@@ -19,10 +19,12 @@ from rclpy.parameter import Parameter
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot.catalogue import config_folder
 from calib_planner.ros import parameter_yaml
+from calib_planner.ros.campaign_node import CampaignNode
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.parameters import descriptor
 from calib_planner.ros.planner_node import PlannerNode
 from calib_planner.ros.settings import (
+    CampaignParameters,
     IdentifierParameters,
     PlannerParameters,
     SimulatorParameters,
@@ -34,6 +36,7 @@ NODES = [
     ("planner", PlannerParameters, PlannerNode),
     ("identifier", IdentifierParameters, IdentifierNode),
     ("simulator", SimulatorParameters, SimulatorNode),
+    ("campaign", CampaignParameters, CampaignNode),
 ]
 
 

@@ -1,0 +1,112 @@
+"""A robot and an identifier in one, without standstills: what the campaign node talks to, as bad as a test wants.
+
+It takes plans, executes goals at once, and publishes what it "measured" of a robot with true errors.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+from calib_planner_msgs.action import ExecutePlan
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import Plan as PlanMessage
+from geometry_msgs.msg import Point
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.node import Node
+
+from calib_planner import Robot
+from calib_planner.ros.conversions import plan_from_message
+from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.simulation import SimulatedCell, random_deviations
+
+Answer = Callable[[np.ndarray], str]
+
+
+class FakeCell(Node):
+    """``answer`` says what becomes of a configuration (joints,):
+
+    ``ok``, ``refuse`` (INVALID_PLAN), ``abort``, ``reject`` (measured, not accepted), ``ignore`` (nothing is
+    published), ``hang`` (no end and no feedback until cancelled).
+    """
+
+    THREADS = 3
+
+    def __init__(self, context: Context | None = None, overrides: object = (), **options: object) -> None:
+        super().__init__("fake_cell", context=context)
+        self.robot = Robot.load("planar_2r")
+        self.cell = SimulatedCell(self.robot, random_deviations(self.robot, 4), 1e-5)
+        self.answer: Answer = lambda q: "ok"
+        self.takes_plans = True
+        self.plans: list[PlanMessage] = []
+        self.visited: list[np.ndarray] = []
+        self.number = 0
+        self.closing = threading.Event()
+        self._plan: PlanMessage | None = None
+        self._rng = np.random.default_rng(1)
+        self._estimates = self.create_publisher(CalibrationEstimate, "calibration_identifier/estimate", LATCHED)
+        self.measurements = self.create_publisher(Measurement, "calibration_identifier/measurements", EVENTS)
+        self.create_subscription(PlanMessage, "calibration_campaign/plan", self._on_plan, LATCHED)
+        self._server = ActionServer(
+            self,
+            ExecutePlan,
+            "tracker_simulator/execute_plan",
+            self._execute,
+            callback_group=ReentrantCallbackGroup(),
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+
+    def close(self) -> None:
+        self.closing.set()
+        self._server.destroy()
+
+    def _on_plan(self, message: PlanMessage) -> None:
+        self.plans.append(message)
+        if self.takes_plans:
+            self._plan = message
+            self._estimates.publish(CalibrationEstimate(plan_id=message.plan_id))
+
+    def _execute(self, goal: object) -> ExecutePlan.Result:
+        q = plan_from_message(goal.request.plan).plan.configurations[0]
+        self.visited.append(q)
+        kind = ExecutePlan.Result
+        answer = self.answer(q)
+        if answer == "hang":
+            while not goal.is_cancel_requested and not self.closing.wait(0.02):
+                pass
+            if goal.is_cancel_requested:
+                goal.canceled()
+            return kind(status=kind.CANCELLED, message="stopped on request")
+        if answer in ("refuse", "abort"):
+            goal.abort()
+            status = kind.INVALID_PLAN if answer == "refuse" else kind.ABORTED
+            return kind(status=status, message=f"cannot go there: {answer}")
+        if answer != "ignore":
+            self.publish(q, accepted=answer == "ok")
+        goal.succeed()
+        return kind(status=kind.SUCCESS, executed=1)
+
+    def publish(
+        self, q: np.ndarray, *, accepted: bool = True, number: int | None = None, **others: object
+    ) -> None:
+        """A measurement at ``q``."""
+        plan = self._plan
+        rows = plan_from_message(plan).plan.configurations
+        self.number = self.number + 1 if number is None else number
+        point = self.cell.truth.positions(q[None])[0, 0] + 1e-5 * self._rng.standard_normal(3)
+        message = Measurement(
+            id=self.number,
+            plan_id=plan.plan_id,
+            configuration_index=int(np.argmin(np.abs(rows - q).max(axis=1))),
+            joint_names=list(self.robot.joint_names),
+            joint_positions=q.tolist(),
+            points=[Point(x=point[0], y=point[1], z=point[2])],
+            status=Measurement.ACCEPTED if accepted else Measurement.REJECTED_MOVED,
+            reason="" if accepted else "the target moved",
+        )
+        for name, value in others.items():
+            setattr(message, name, value)
+        self.measurements.publish(message)
