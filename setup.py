@@ -48,6 +48,7 @@ setup(
             "planner_node = calib_planner.ros.planner_node:main",
             "identifier_node = calib_planner.ros.identifier_node:main",
             "simulator_node = calib_planner.ros.simulator_node:main",
+            "campaign_node = calib_planner.ros.campaign_node:main",
         ],
     },
 )

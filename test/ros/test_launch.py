@@ -19,12 +19,18 @@ import pytest
 from calib_planner.robot.catalogue import config_folder
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.planner_node import PlannerNode
-from calib_planner.ros.settings import IdentifierParameters, PlannerParameters, SimulatorParameters
+from calib_planner.ros.settings import (
+    CampaignParameters,
+    IdentifierParameters,
+    PlannerParameters,
+    SimulatorParameters,
+)
 from calib_planner.ros.simulator_node import SimulatorNode
 
 FOLDER = config_folder().parent / "launch"
 FILES = sorted(FOLDER.glob("*.launch.py"))
 NODES: dict[str, tuple[str, type]] = {
+    "campaign": ("calibration_campaign", CampaignParameters),
     "planner": ("calibration_planner", PlannerParameters),
     "identifier": ("calibration_identifier", IdentifierParameters),
     "simulator": ("tracker_simulator", SimulatorParameters),
@@ -33,7 +39,7 @@ NAMES = {name for name, _ in NODES.values()}
 
 
 def test_all_are_there() -> None:
-    assert [p.name.split(".")[0] for p in FILES] == ["demo", "identifier", "planner", "simulator"]
+    assert [p.name.split(".")[0] for p in FILES] == ["campaign", "demo", "identifier", "planner", "simulator"]
     assert all((PlannerNode, IdentifierNode, SimulatorNode))
 
 

@@ -12,6 +12,7 @@ from rclpy.action import get_action_client_names_and_types_by_node, get_action_s
 from rclpy.node import Node
 
 from calib_planner.robot.catalogue import config_folder
+from calib_planner.ros.campaign_node import CampaignNode
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.planner_node import PlannerNode
 from calib_planner.ros.simulator_node import SimulatorNode
@@ -22,6 +23,7 @@ NODES = {
     "/calib_planner/planner": PlannerNode,
     "/calib_planner/identifier": IdentifierNode,
     "/calib_planner/simulator": SimulatorNode,
+    "/calib_planner/campaign": CampaignNode,
 }
 
 
