@@ -1,7 +1,7 @@
 """Simulated cells for the benches: everything drawn from a seed, wrong in the ways that a case says.
 
 Model discrepancy is an error of each joint's transmission, a random function of its angle with a squared
-exponential spectrum, and a white error of each configuration and target. Gross errors are 10–50 mm in any direction.
+exponential spectrum, and a white error of each configuration and target. Gross errors: 10–50 mm, any direction.
 """
 
 from __future__ import annotations
