@@ -75,3 +75,12 @@ assert "rclpy" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+def test_campaigns_use_only_the_rooms_above_them() -> None:
+    above = {"robot", "instrument", "design", "identification", "simulation", "adaptive", "errors", "_arrays"}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        used = {m.split(".")[1] for m in imports(path) if m.startswith("calib_planner.")}
+        assert room != "adaptive" or used <= above, path
+        assert room not in above - {"adaptive"} or "adaptive" not in used, path

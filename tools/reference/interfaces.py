@@ -53,6 +53,7 @@ def nodes() -> dict[str, list[tuple[str, ...]]]:
     """Node name → rows (name, kind, type, quality of service) of all that it offers and takes."""
     from rclpy.context import Context
 
+    from calib_planner.ros.campaign_node import CampaignNode
     from calib_planner.ros.identifier_node import IdentifierNode
     from calib_planner.ros.planner_node import PlannerNode
     from calib_planner.ros.simulator_node import SimulatorNode
@@ -61,7 +62,7 @@ def nodes() -> dict[str, list[tuple[str, ...]]]:
     context.init(args=["--ros-args", "-r", f"__ns:={NAMESPACE}"], domain_id=DOMAIN)
     found = {}
     try:
-        for kind in (PlannerNode, IdentifierNode, SimulatorNode):
+        for kind in (PlannerNode, IdentifierNode, SimulatorNode, CampaignNode):
             node = kind(context=context)
             node.trigger_configure()
             node.trigger_activate()
