@@ -276,7 +276,7 @@ class CampaignParameters(LifecycleParameters):
     store_folder: str = parameter(
         "",
         "folder of the campaign's journal and results: a restart goes on there; empty = lost with the node",
-        at_configure=True,
+        read_only=True,
     )
     execute_action: str = parameter(
         "tracker_simulator/execute_plan", "the robot: an ExecutePlan action", at_configure=True
