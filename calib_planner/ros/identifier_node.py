@@ -64,7 +64,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
     # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
 
     def configure(self) -> None:
-        """Load the robot and the campaign in the store, offer services, listen for plans."""
+        """Load the robot and the campaign in the store, offer services, listen for plans and streams."""
         chosen = self.settings.value
         if not chosen.store_folder:
             text = "the campaign is in memory only and lost with the node: set store_folder to keep it"
@@ -75,25 +75,29 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self.create_subscription(PlanMessage, chosen.plan_topic, self._on_plan, LATCHED)
         if chosen.use_robot_description:
             self.create_subscription(String, TOPIC, self._on_description, LATCHED)
-        for name in ("reset", "undo", "save", "report"):
-            self.create_service(Trigger, f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
-        self.create_service(UndoMeasurement, "~/undo_measurement", self._on_undo)
-
-    def activate(self) -> None:
-        """Hear the streams."""
-        chosen = self.settings.value
-        joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
-        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
         streams = [Stream(JointState, JOINTS, self._on_joints, partial(self._on_lost, 0))]
         for k, topic in enumerate(chosen.tracker_topics):
             hear, lost = partial(self._on_point, k), partial(self._on_lost, 1 + k)
             streams.append(Stream(PointStamped, topic, hear, lost))
         StreamPoller(self, streams)
+        for name in ("reset", "undo", "save", "report"):
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
+        self.create_service(UndoMeasurement, "~/undo_measurement", self._on_undo)
+
+    def activate(self) -> None:
+        """Take what the streams say."""
+        chosen = self.settings.value
+        joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
+        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         self.create_timer(chosen.diagnostics_period, self._tick, clock=steady)
         self._update()
         ready = self._waiting if self._campaign is None else f"ready to identify {self._campaign.robot.name}"
         self.get_logger().info(ready)
+
+    def deactivate(self) -> None:
+        """Let the streams pass."""
+        self._intake = None
 
     # ── which robot, which campaign ──────────────────────────────────────────────────────────────────
 

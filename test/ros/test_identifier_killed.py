@@ -1,0 +1,140 @@
+"""The identifier as a process, killed with -9 while it is fed: the campaign goes on, the estimate is the same."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench import DOMAIN, Bench
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import Plan as PlanMessage
+from geometry_msgs.msg import PointStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from robots import plan_of, random_configurations
+from sensor_msgs.msg import JointState
+
+from calib_planner import Robot
+from calib_planner.files.campaign_records import ACCEPTED
+from calib_planner.files.campaign_schema import FILE
+from calib_planner.files.campaign_store import open_store, stored_model
+from calib_planner.instrument.standstill import NANO
+from calib_planner.ros.conversions import joints_message, plan_to_message, point_message
+from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.simulation import random_deviations
+
+NAME = "calibration_identifier"
+ROBOT = Robot.load("planar_2r").with_parameters("lengths+offsets")
+TRUE = ROBOT.with_deviations(random_deviations(ROBOT, 6))
+PLAN = plan_of(ROBOT, random_configurations(ROBOT, 8, 5))
+DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class Feeder:
+    """Publishes what is seen at rows of the plan, the same numbers at every attempt, each at a later time."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench, self.stamp = bench, 1000 * NANO
+        create = bench.client.create_publisher
+        self.joints = create(JointState, "joint_states", DEEP)
+        self.points = create(PointStamped, "tracker/point", DEEP)
+        self.plans = create(PlanMessage, "calibration_planner/current_plan", LATCHED)
+        self.estimates = bench.hear(CalibrationEstimate, f"{NAME}/estimate", LATCHED)
+        self.measurements = bench.hear(Measurement, f"{NAME}/measurements", EVENTS)
+
+    def row(self, row: int, pause: float = 0.0005) -> None:
+        """A standstill of 0.8 s and the way on, in a tenth of that time."""
+        rng, q = np.random.default_rng(row), PLAN.configurations[row]
+        point = TRUE.positions(q)[0, 0] + 3e-5 / np.sqrt(20) * rng.standard_normal(3)
+        for i in range(90):
+            self.stamp += 10**7 if i < 80 else NANO // 5
+            here = q if i < 80 else q + 0.01 * (i - 60)
+            self.joints.publish(joints_message(ROBOT.joint_names, here, self.stamp))
+            self.points.publish(point_message(point, self.stamp, "laser"))
+            time.sleep(pause)
+
+    def has(self, configurations: int) -> bool:
+        """Whether the newest estimate is of the plan and of so many configurations."""
+        newest = self.estimates[-1:]
+        return [(e.plan_id, e.configurations) for e in newest] == [("p", configurations)]
+
+    def accepted(self, row: int, after: int) -> bool:
+        """Whether the row was told to be accepted, later than so many messages."""
+        news = self.measurements[after:]
+        return any((m.configuration_index, m.status) == (row, Measurement.ACCEPTED) for m in news)
+
+    def measure(self, row: int) -> None:
+        """Feed a row until it is told to be accepted."""
+        for _ in range(5):
+            count = len(self.measurements)
+            self.row(row)
+            try:
+                self.bench.wait(partial(self.accepted, row, count), 10.0)
+            except AssertionError:
+                continue
+            return
+        raise AssertionError(f"row {row} was not accepted: {self.measurements[-1:]}")
+
+
+def started(folder: Path, log: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "calib_planner.ros.identifier_node", "--ros-args"]
+    for topic in ("joint_states", "tracker/point"):
+        command += ["-p", f"qos_overrides./{topic}.subscription.reliability:=reliable"]
+    command += ["-p", "robot:=planar_2r", "-p", f"store_folder:={folder}"]
+    environment = os.environ | {"ROS_DOMAIN_ID": str(DOMAIN), "PYTHONUNBUFFERED": "1"}
+    with log.open("ab") as sink:
+        return subprocess.Popen(command, stdout=sink, stderr=sink, env=environment)
+
+
+def stored(folder: Path) -> list[int | None]:
+    """Rows of the plan that are in the store, in the order of measuring."""
+    if not (folder / FILE).exists():
+        return []
+    model = stored_model(str(folder))
+    if model is None:
+        return []
+    store = open_store(str(folder), model, {}, "")
+    found = store.current()
+    store.close()
+    return [] if found is None else [d.index for d in found.decisions if d.status == ACCEPTED]
+
+
+@pytest.mark.timeout(300)
+def test_a_node_killed_while_it_is_fed_goes_on(bench: Bench, tmp_path: Path) -> None:
+    feeder, rng, log = Feeder(bench), random.Random(2), tmp_path / "log"
+    feeder.plans.publish(plan_to_message(PLAN, "p", 0, "base"))
+    finals = []
+    for name, kills in (("undisturbed", 0), ("killed", 3)):
+        done = 0
+        for k in range(kills + 1):
+            rows = stored(tmp_path / name)
+            assert rows == list(range(len(rows))) and len(rows) >= done, "told and lost"
+            with started(tmp_path / name, log) as process:
+                try:
+                    # What the process before still had under way may come late: the right one comes last.
+                    bench.wait(lambda: feeder.joints.get_subscription_count() > 0, 60.0)
+                    bench.wait(partial(feeder.has, len(rows)))
+                    last = len(PLAN.configurations) if k == kills else len(rows) + rng.randrange(1, 3)
+                    for row in range(len(rows), last):
+                        feeder.measure(row)
+                        done = row + 1
+                    if k == kills:
+                        bench.wait(lambda: feeder.estimates[-1].complete)
+                    else:
+                        feeder.row(last, pause=rng.choice([0.0, 0.0002, 0.001]))
+                        time.sleep(rng.random() * 0.2)
+                finally:
+                    process.kill()
+        finals.append(feeder.estimates[-1])
+    assert "Traceback" not in log.read_text()
+    for e in finals:
+        assert (e.measurements, e.configurations, e.status) == (8, 8, CalibrationEstimate.STATUS_OK)
+    a, b = finals
+    assert np.allclose(a.value, b.value, rtol=0, atol=1e-12)
+    assert np.allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)
