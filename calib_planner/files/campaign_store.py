@@ -192,15 +192,6 @@ class CampaignStore:
                 for decision in decisions:
                     _decide(write, campaign, decision.number, decision)
 
-    def probe(self) -> bool:
-        """Try to write; whether that works is in ``trouble``, too."""
-        try:
-            with self._writing() as write:
-                write.execute("UPDATE current SET campaign = campaign")
-        except StoreError:
-            return False
-        return True
-
     # ── inside ───────────────────────────────────────────────────────────────────────────────────────
 
     def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Decision]) -> StoredCampaign:

@@ -161,7 +161,7 @@ def _store(campaign: Campaign) -> Finding:
     store = campaign.store
     values = {"file": "" if store.path is None else store.path, "standstills kept": len(campaign.kept)}
     if store.trouble:
-        return ERROR, f"nothing is accepted: {store.trouble}", values
+        return ERROR, f"the last standstill was not stored: {store.trouble}; the next one tries again", values
     if store.path is None and not isinstance(store, UnavailableStore):
         return WARN, "in memory only, lost with the node: set store_folder", values
     return OK, "every accepted measurement is on disk", values

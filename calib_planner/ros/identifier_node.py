@@ -5,8 +5,7 @@ Standstills are found in ``streams``, matched to the plan, stored and identified
 to disk and an identification, some 20 ms together, for which the queues of the streams are deep enough by far.
 
 A measurement is acknowledged on ``~/measurements`` after it is on the disk. As long as that cannot be written,
-standstills are rejected as not stored and the node goes on; it looks every time, and with every message on
-``/diagnostics``, whether it can be written again.
+standstills are rejected as not stored and the node goes on; the next standstill tries again.
 """
 
 from __future__ import annotations
@@ -243,12 +242,10 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self._output.description("" if self._model is None else self._model.urdf, found)
 
     def _tick(self) -> None:
-        """Say how it goes; look whether a store in trouble is well again."""
+        """Say how it goes; look whether a store that could not be opened can be."""
         campaign, intake, chosen = self._campaign, self._intake, self.settings.value
         if campaign is not None and isinstance(campaign.store, UnavailableStore):
             self._reopen()
-        elif campaign is not None and campaign.store.trouble and campaign.store.probe():
-            self.get_logger().info("the store can be written again")
         if intake is not None:
             now, seconds = self.get_clock().now().nanoseconds, chosen.diagnostics_period
             health = intake.health(now, seconds)
