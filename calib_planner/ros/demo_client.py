@@ -26,6 +26,10 @@ from calib_planner.ros.qos import EVENTS, LATCHED
 
 ATTEMPT = 8.0
 """Seconds after which an unanswered call is repeated."""
+NOT_YET = (PlanCalibration.Response.BUSY, PlanCalibration.Response.NOT_READY)
+"""Answers of a planner that is still planning or not active yet: asked again after a pause."""
+PAUSE = 0.3
+"""That pause [s]."""
 
 
 class DemoClient:
@@ -165,8 +169,10 @@ class DemoClient:
             future = client.call_async(request)
             if self.wait(future.done, ATTEMPT):
                 response = future.result()
-                if getattr(response, "status", 0) != PlanCalibration.Response.BUSY:
+                later = time.monotonic() + PAUSE < deadline
+                if not later or getattr(response, "status", 0) not in NOT_YET:
                     return response
+                self.wait(lambda: False, PAUSE)
             client.remove_pending_request(future)
         raise CalibPlannerError(f"no {what} within {seconds:g} s")
 
