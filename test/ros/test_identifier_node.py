@@ -338,7 +338,8 @@ def test_a_folder_that_cannot_be_opened_yet(bench: Bench, robot: Robot, planned:
     shift.announce(planned)
     assert shift.rest(planned.configurations[0]).status == Measurement.REJECTED_NOT_STORED
     (tmp_path / "blocked").unlink()
-    bench.wait(lambda: (tmp_path / "blocked" / FILE).exists() and not shift.node._campaign.store.trouble)
+    bench.wait(lambda: (c := shift.node._campaign) is not None and not c.store.trouble)
+    assert (tmp_path / "blocked" / FILE).exists()
     assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
     assert shift.estimates[-1].plan_id == "p"
 
