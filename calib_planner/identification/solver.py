@@ -39,7 +39,7 @@ from calib_planner.identification.robust import (
 )
 from calib_planner.identification.structure import SIGNIFICANT, Structure, residual_structure
 from calib_planner.identification.suspicions import check_units
-from calib_planner.identification.transmission import Transmission, fit_transmission
+from calib_planner.identification.transmission import Transmission, fit_transmission, geometry_covariance
 from calib_planner.identification.weighing import TINY, Weighed, weigh
 from calib_planner.identification.work import Work, without_unseen
 from calib_planner.robot.chain import Robot
@@ -79,6 +79,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         found = _gated(work, found)
     found, starts, agreeing = _other_starts(work, found)
     structure = _structure(work, found)
+    transmission = _transmission(work, found, structure)
     evidence = Evidence(
         problem=problem,
         robot=robot,
@@ -87,7 +88,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         identifiability=work.identifiability,
         resolved=tuple(sorted(set(found.fit.kept) & set(work.identifiability.held))),
         levels=found.levels,
-        covariance=found.covariance,
+        covariance=_covariance(work, found, transmission),
         chi_square=found.chi_square,
         freedom=found.freedom,
         normalised=_normalised(work, found),
@@ -97,7 +98,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         structure=structure,
         disturbances=_disturbances(work, found),
         moved_since=rejected_since(problem.data.seen, found.equations.use),
-        transmission=_transmission(work, found, structure),
+        transmission=transmission,
         starts=starts,
         agreeing=agreeing,
         seconds=time.perf_counter() - began,
@@ -232,10 +233,24 @@ def _transmission(work: Work, found: Weighed, structure: tuple[Structure, ...]) 
     reason = found.levels.discrepancy > 0 or any(s.probability < SIGNIFICANT for s in structure)
     if work.problem.joint_corrections == "off" or not reason or not found.fit.converged:
         return None
-    # Where the instrument's noise is unknown it is part of the white noise that is estimated there.
-    unknown = found.levels.source == "residuals"
-    instrument = TINY * work.instrument if unknown else found.levels.scaled**2 * work.instrument
+    instrument = _instrument(work, found)
     return fit_transmission(found.equations, found.fit.deviations, found.fit.kept, instrument, work.labels)
+
+
+def _instrument(work: Work, found: Weighed) -> FloatArray:
+    """Where the instrument's noise is unknown it is part of the white noise that is estimated there."""
+    if found.levels.source == "residuals":
+        return TINY * work.instrument
+    if found.levels.source == "repetitions":
+        return (found.levels.measurement / work.unit) ** 2 * work.instrument
+    return found.levels.scaled**2 * work.instrument
+
+
+def _covariance(work: Work, found: Weighed, transmission: Transmission | None) -> FloatArray:
+    """cov(Π̂): configurations that share a joint angle share its error, as far as that is known."""
+    if transmission is None:
+        return found.covariance
+    return geometry_covariance(transmission, found.equations, found.fit, _instrument(work, found), work.labels)
 
 
 def _disturbances(work: Work, found: Weighed) -> tuple[Disturbance, ...]:

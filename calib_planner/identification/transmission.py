@@ -28,7 +28,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ive
 
 from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.identification.equations import Equations
+from calib_planner.identification.equations import Equations, block_covariance
+from calib_planner.identification.least_squares import Fit
 from calib_planner.identification.noise_levels import DiscrepancyModel
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.joint_corrections import JointCorrections, harmonics, phases
@@ -144,6 +145,55 @@ def fit_transmission(
     if hyper is None:
         return None
     return _fit(equations, deviations, kept, instrument, labels, hyper)
+
+
+def geometry_covariance(
+    transmission: Transmission, equations: Equations, fit: Fit, instrument: FloatArray, labels: IntArray
+) -> FloatArray:
+    """Covariance of the geometric estimate beside the complete model: (P, P).
+
+    Its weights W know nothing of the errors that configurations share. With J Jacobian, C = (Jᵀ W J + P)⁻¹, P the
+    prior's, and the covariance V of the points that the complete model tells, it is C (Jᵀ W V W J + P) C.
+
+    Args:
+        transmission: Of the same points.
+        equations: Of the geometric fit.
+        fit: Where it ended.
+        instrument: (N, targets, 3, 3) covariance of the measurement; tiny where it is unknown [m²].
+        labels: (N,) configuration of each row.
+    """
+    data, use = equations.data, equations.use
+    whitened = equations.linearise(fit.deviations)[1]
+    count = 3 * int(use.sum())
+    weighted, prior = np.empty_like(whitened[:count]), whitened[count:]
+    for index, factor in zip(equations.whitening.index, equations.whitening.factor, strict=True):
+        if factor.ndim == 2:
+            weighted[index[:, 0]] = factor * whitened[index[:, 0]]
+        else:
+            weighted[index] = np.swapaxes(factor, 1, 2) @ whitened[index]
+    waves = _columns(transmission.robot, transmission.corrections, data.q, [])[use].reshape(count, -1)
+    spread = np.sqrt(
+        np.ravel(
+            _variances(transmission.length, transmission.amplitude, np.asarray(transmission.corrections.scale))
+        )
+    )
+    shared = weighted.T @ (waves * np.tile(spread, 2))
+    middle = prior.T @ prior + shared @ shared.T
+    model = DiscrepancyModel.of(equations, instrument, labels)
+    white = {"point": transmission.point, "turning": transmission.turning, "sliding": 0.0}
+    together = np.hstack([white.get(n, 0.0) * c for n, c in zip(model.names, model.columns, strict=True)])
+    for index in model.blocks:
+        rows = weighted[index]
+        middle += np.einsum(
+            "bip,bij,bjq->pq", rows, block_covariance(index, model.instrument, together), rows, optimize=True
+        )
+    covariance = fit.covariance()
+    return np.asarray(covariance @ middle @ covariance)
+
+
+def _variances(length: float, amplitude: float, scale: FloatArray) -> FloatArray:
+    """(joints, harmonics) prior variances of the coefficients."""
+    return np.asarray(amplitude**2 * spectrum(length) / scale[:, None] ** 2)
 
 
 def kernel(difference: FloatArray, length: float) -> FloatArray:

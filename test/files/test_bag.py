@@ -23,6 +23,7 @@ from calib_planner import CalibPlannerError, FileFormatError, IdentificationProb
 from calib_planner.errors import MissingExtraError
 from calib_planner.files.bag import read_bag
 from calib_planner.files.bag_storage import BagTopics, is_bag, storage_parts
+from calib_planner.files.campaign_store import StoredModel, open_store
 from calib_planner.instrument.standstill import Rejection, Standstill, StandstillDetector, StandstillSettings
 from calib_planner.ros.campaign import Campaign, Matching
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -56,7 +57,8 @@ def test_a_bag_gives_what_the_node_gives(tmp_path: Path, plugin: str, compressio
         assert (mine.start, mine.stop) == (node.start, node.stop)
         assert mine.joints.tobytes() == node.joints.tobytes() == found.data.q[row].tobytes()
         assert mine.points.tobytes() == node.points.tobytes() == found.data.p[row].tobytes()
-    live = Campaign(PLANAR, lambda _: PLANAR)
+    model = StoredModel(PLANAR.name, PLANAR.joint_names, len(PLANAR.targets), "")
+    live = Campaign(PLANAR, lambda _: PLANAR, open_store("", model, {}, ""))
     how = Matching(accept_unplanned=True, sigma=0.0)
     for node in expected:
         live.take(node, how)
