@@ -23,6 +23,7 @@ from calib_planner.design.plan import Plan
 from calib_planner.errors import CalibPlannerError, InputError, NotEnoughDataError, StoreError, UnknownNameError
 from calib_planner.files.campaign_records import ACCEPTED, KEPT, OUTLIER, UNDONE, Decision
 from calib_planner.files.campaign_store import CampaignStore, StoredCampaign
+from calib_planner.identification.accumulator import UPDATE
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.problem import IdentificationProblem
@@ -265,9 +266,9 @@ class Campaign:
         poses = self.plan.test_poses if self.plan is not None and len(self.plan.test_poses) else None
         if data is None:
             raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-        # At every standstill: what takes seconds is left to the analysis of the finished campaign.
-        quick = {"joint_corrections": "off", "starts": 0}
-        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses, **quick)  # type: ignore[arg-type]
+        # At every standstill: what takes long is left to the finished campaign, or to its analysis.
+        quick = dict(UPDATE) | ({"order_check": "auto"} if self.complete else {})
+        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses, **quick)
 
     def estimate(self, how: Matching) -> Estimate | TooFew:
         """Identify with what there is."""
