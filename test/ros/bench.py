@@ -6,6 +6,7 @@ answer can be published before discovery has matched its reader.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 import time
@@ -25,7 +26,13 @@ from rclpy.qos import QoSProfile
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.run import spin_once
 
-DOMAIN = 1 + (os.getpid() * 53 + 11) % 100
+_count = itertools.count(os.getpid() * 53)
+_worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+
+
+def next_domain() -> int:
+    """A ROS domain that nothing here used lately: nodes that were killed stay on the graph for a while."""
+    return 1 + 25 * (_worker % 4) + next(_count) % 25
 
 
 def overrides(values: Mapping[str, Any]) -> list[Parameter]:
@@ -34,8 +41,8 @@ def overrides(values: Mapping[str, Any]) -> list[Parameter]:
 
 class Bench:
     def __init__(self) -> None:
-        self.context = Context()
-        rclpy.init(args=[], context=self.context, domain_id=DOMAIN)
+        self.context, self.domain = Context(), next_domain()
+        rclpy.init(args=[], context=self.context, domain_id=self.domain)
         self.client = Node("test_client", context=self.context)
         self.nodes: list[Node] = []
         self.actions: list[ActionClient] = []

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench import DOMAIN, Bench
+from bench import Bench
 from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from fake_cell import FakeCell
@@ -133,11 +133,11 @@ def test_a_campaign_with_simulator_and_identifier(bench: Bench, tmp_path: Path) 
     np.testing.assert_array_equal(saved.deviations, found.deviations)
 
 
-def simulator_process(folder: Path) -> subprocess.Popen[bytes]:
+def simulator_process(folder: Path, domain: int) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "calib_planner.ros.simulator_node", "--ros-args"]
     for name, value in SIMULATOR.items():
         command += ["-p", f"{name}:={value}"]
-    environment = os.environ | {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with (folder / "simulator.log").open("ab") as log:
         return subprocess.Popen(command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
 
@@ -145,14 +145,14 @@ def simulator_process(folder: Path) -> subprocess.Popen[bytes]:
 def test_a_robot_killed_on_the_way_is_waited_for(bench: Bench, tmp_path: Path) -> None:
     bench.start(IdentifierNode, **IDENTIFIER)
     desk = Desk(bench, silence=1.5)
-    processes = [simulator_process(tmp_path)]
+    processes = [simulator_process(tmp_path, bench.domain)]
     try:
         assert desk.call("start")[0]
         desk.until(S.MEASURING, 60.0, measured=3)
         processes[0].kill()
         waiting = desk.until(S.WAITING, 30.0)
         assert "execute_plan" in waiting.reason and waiting.measured >= 3
-        processes.append(simulator_process(tmp_path))
+        processes.append(simulator_process(tmp_path, bench.domain))
         done = desk.until(S.DONE, 120.0)
         assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
     finally:

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from bench import next_domain
 
-from calib_planner.ros.processes import Nodes, node_names, own_domain
+from calib_planner.ros.processes import Nodes, node_names
 
 PARENT = """
 import sys, time
@@ -45,7 +46,7 @@ def wait(condition: Callable[[], bool], seconds: float = 40.0) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes by /proc")
 def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     names = node_names()
-    command = [sys.executable, "-c", PARENT, str(tmp_path), str(own_domain()), *names]
+    command = [sys.executable, "-c", PARENT, str(tmp_path), str(next_domain()), *names]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         pids = [int(word) for word in parent.stdout.readline().split()]
@@ -65,7 +66,7 @@ def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
-    with Nodes(tmp_path, own_domain()) as nodes:
+    with Nodes(tmp_path, next_domain()) as nodes:
         for name in node_names():
             nodes.start(name)
         logs = [tmp_path / f"{name}.log" for name in node_names()]

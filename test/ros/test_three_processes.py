@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench import next_domain
 from calib_planner_msgs.msg import CalibrationEstimate
 from calib_planner_msgs.srv import PlanCalibration
 
@@ -18,19 +19,19 @@ from calib_planner import Robot
 from calib_planner.ros import demo
 from calib_planner.ros.conversions import estimate_from_message
 from calib_planner.ros.demo_client import DemoClient
-from calib_planner.ros.processes import Nodes, ProcessFailed, node_names, own_domain
+from calib_planner.ros.processes import Nodes, ProcessFailed, node_names
 from calib_planner.simulation import random_deviations
 
 SEED = 11
-DOMAIN = own_domain()
 
 
 def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
-    with Nodes(tmp_path, DOMAIN) as nodes:
+    domain = next_domain()
+    with Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 16})
         nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
         nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7})
-        client = DemoClient(DOMAIN, nodes.check)
+        client = DemoClient(domain, nodes.check)
         try:
             request = PlanCalibration.Request(
                 robot="kuka_kr270",
@@ -63,17 +64,18 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
-    with Nodes(tmp_path, DOMAIN) as nodes:
+    domain = next_domain()
+    with Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 5000})
-        client = DemoClient(DOMAIN, nodes.check)
+        client = DemoClient(domain, nodes.check)
         try:
             client.wait(client._plan.service_is_ready, 20.0, "service")
             pose = [0.0, -1.0, 1.5, 0.0, 0.8, 0.0]
             long = PlanCalibration.Request(test_poses=pose, configurations=150, parameters=["full"])
-            client._plan.call_async(long)
             busy = PlanCalibration.Request(test_poses=pose, configurations=3)
 
             def planning() -> bool:
+                client._plan.call_async(long)
                 future = client._plan.call_async(busy)
                 client.wait(future.done, 3.0)
                 return future.done() and future.result().status == PlanCalibration.Response.BUSY
@@ -86,9 +88,10 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
 
 
 def test_a_node_that_fails_is_reported(tmp_path: Path) -> None:
-    with Nodes(tmp_path, DOMAIN) as nodes:
+    domain = next_domain()
+    with Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"robt": "planar_2r"})
-        client = DemoClient(DOMAIN, nodes.check)
+        client = DemoClient(domain, nodes.check)
         try:
             with pytest.raises(ProcessFailed, match="planner_node ended with status 1") as caught:
                 client.wait(lambda: False, 20.0)
