@@ -12,8 +12,8 @@ setup: ## make .venv and build the interfaces; seconds when nothing changed
 demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 	@. ./env.sh && python -m calib_planner.ros.demo
 
-test: setup ## run every test (more options: make test PYTEST='-k plan')
-	@. ./env.sh && python -m pytest $(PYTEST)
+test: setup ## run every test, in as many processes as there are cores (PYTEST='-k plan' for some)
+	@. ./env.sh && python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST)
 
 docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
 	@. ./env.sh && python tools/reference && \
