@@ -12,7 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from calib_planner import Robot
-from calib_planner.simulation import SimulatedCell
+from calib_planner.simulation import SimulatedCell, random_deviations
 from calib_planner.simulation.motion import make_tour
 
 NANO = 1_000_000_000
@@ -106,3 +106,9 @@ def robot_of(name: str, targets: int = 1) -> Robot:
     if targets == 1:
         return robot
     return robot.with_targets(0.1 * np.random.default_rng(5).standard_normal((targets, 3)))
+
+
+PLANAR = robot_of("planar_2r")
+CELL = SimulatedCell(PLANAR, random_deviations(PLANAR, 1))
+STOPS = np.array([[0.5, 1.0], [-1.0, 0.4], [0.5, 1.0], [0.2, -1.2]])
+SAID = campaign(CELL, STOPS)

@@ -2,79 +2,28 @@
 
 from __future__ import annotations
 
-import os
 import random
 import sqlite3
-import subprocess
-import sys
-import textwrap
-from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from stores import MODEL, assert_same, begun, decision, opened, standstill
 
-from calib_planner import Plan, PlanProblem, Robot, plan
+from calib_planner import Plan
 from calib_planner.errors import FileFormatError, InputError, StoreError
-from calib_planner.files.campaign_records import LONGEST, Decision
+from calib_planner.files.campaign_records import LONGEST
 from calib_planner.files.campaign_schema import FILE, MIGRATIONS
 from calib_planner.files.campaign_store import (
     CampaignStore,
     StoredModel,
     UnavailableStore,
-    open_store,
     stored_model,
 )
 from calib_planner.instrument.standstill import Reason, Rejection, Standstill
 
 MOVED = Rejection(3, 4, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0]))
-MODEL = StoredModel("arm", ("q1", "q2"), 2, "links: [1, 0.7]  # Länge")
-
-
-def opened(folder: Path | str, model: StoredModel = MODEL, **settings: object) -> CampaignStore:
-    return open_store(str(folder), model, settings, "1.2.3")
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[CampaignStore]:
-    made = opened(tmp_path)
-    yield made
-    made.close()
-
-
-@pytest.fixture(scope="module")
-def planned() -> Plan:
-    robot = Robot.load("planar_2r").with_parameters("lengths+offsets")
-    return plan(PlanProblem(robot, [0.3, 0.5], 4, starts=4))
-
-
-def standstill(seed: int, *, seen: tuple[bool, bool] = (True, True)) -> Standstill:
-    """Numbers that only exact writing brings back."""
-    rng = np.random.default_rng(seed)
-    unseen = ~np.array(seen)
-    points, std = rng.standard_normal((2, 3)) * 10.0 ** rng.integers(-300, 300, (2, 3)), rng.random(2)
-    points[unseen], std[unseen] = np.nan, np.nan
-    start = 1_700_000_000_000_000_000 + seed
-    return Standstill(start, start + 7, rng.standard_normal(2), points, std, rng.integers(1, 99, 2))
-
-
-def decision(found: Standstill | Rejection, status: str = "accepted", **others: object) -> Decision:
-    return replace(Decision(found, status, "", 1, 0, frame="läser"), **others)  # type: ignore[arg-type]
-
-
-def begun(store: CampaignStore, plan_id: str = "p", planned: Plan | None = None) -> int:
-    return store.begin(plan_id, planned).number
-
-
-def assert_same(a: Decision, b: Decision) -> None:
-    for f in fields(Decision):
-        if f.name != "found":
-            assert getattr(a, f.name) == getattr(b, f.name), f.name
-    assert type(a.found) is type(b.found)
-    for f in fields(a.found):
-        x, y = getattr(a.found, f.name), getattr(b.found, f.name)
-        assert np.array_equal(x, y, equal_nan=True) if isinstance(x, np.ndarray) else x == y, f.name
 
 
 # ── exact ────────────────────────────────────────────────────────────────────────────────────────────
@@ -361,144 +310,3 @@ def test_without_a_folder_it_is_in_memory(tmp_path: Path, monkeypatch: pytest.Mo
     store.record(begun(store), decision(standstill(1)))
     found = store.current()
     assert found is not None and len(found.decisions) == 1 and not list(tmp_path.iterdir())
-
-
-# ── disks ────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_a_full_database_changes_nothing_and_recovers(store: CampaignStore) -> None:
-    campaign = begun(store)
-    kept = store.record(campaign, decision(standstill(1)))
-    pages = store._database.execute("PRAGMA page_count").fetchone()[0]
-    store._database.execute(f"PRAGMA max_page_count = {pages}")
-    with pytest.raises(StoreError, match="full"):
-        for k in range(1000):
-            kept = store.record(campaign, decision(standstill(k)))
-    for _ in range(3):
-        with pytest.raises(StoreError, match="full"):
-            store.record(campaign, decision(standstill(1), frame="x" * LONGEST))
-    found = store.current()
-    assert found is not None and found.decisions[-1].number == kept
-    store._database.execute("PRAGMA max_page_count = 100000")
-    assert store.record(campaign, decision(standstill(2))) == kept + 1
-
-
-def test_a_read_only_disk_changes_nothing_and_recovers(store: CampaignStore, planned: Plan) -> None:
-    campaign = begun(store)
-    number = store.record(campaign, decision(standstill(1)))
-    store._database.execute("PRAGMA query_only = ON")  # answers as a file system mounted read-only does
-    for attempt in (
-        lambda: store.record(campaign, decision(standstill(2))),
-        lambda: store.decide(campaign, [decision(standstill(1), number=number)]),
-        lambda: store.begin("other", planned),
-        lambda: store.restart("p", None),
-    ):
-        with pytest.raises(StoreError, match="readonly"):
-            attempt()
-    store._database.execute("PRAGMA query_only = OFF")
-    found = store.current()
-    assert found is not None and found.number == campaign and [d.number for d in found.decisions] == [number]
-    assert store.record(campaign, decision(standstill(2))) == number + 1
-
-
-LIMITED = """
-    import resource, sys
-    from test_campaign_store import *
-    store = opened(sys.argv[1])
-    campaign = begun(store)
-    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, hard))
-    kept, refused = [], 0
-    for k in range(400):
-        try:
-            kept.append(store.record(campaign, decision(standstill(k))))
-        except StoreError as error:
-            refused += 1
-    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
-    after = [store.record(campaign, decision(standstill(k))) for k in range(5)]
-    print(refused, *kept, *after)
-"""
-
-
-def run_script(script: str, folder: Path) -> subprocess.Popen[str]:
-    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([paths, os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-c", textwrap.dedent(script), str(folder)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-
-
-def test_writes_that_the_system_refuses(tmp_path: Path) -> None:
-    pytest.importorskip("resource")
-    with run_script(LIMITED, tmp_path) as process:
-        refused, *kept = map(int, process.communicate(timeout=120)[0].split())
-    assert process.returncode == 0 and refused > 10 and len(kept) > 10
-    store = opened(tmp_path)
-    found = store.current()
-    store.close()
-    assert found is not None and [d.number for d in found.decisions] == kept
-
-
-def test_a_file_that_is_taken_away_is_noticed(tmp_path: Path, store: CampaignStore) -> None:
-    campaign = begun(store)
-    (tmp_path / FILE).rename(tmp_path / "elsewhere")
-    with pytest.raises(StoreError, match="put it back"):
-        store.record(campaign, decision(standstill(1)))
-    (tmp_path / "elsewhere").rename(tmp_path / FILE)
-    assert store.record(campaign, decision(standstill(1))) == 1
-
-
-@pytest.mark.parametrize("folder", ["file/below", "file"])
-def test_a_folder_that_cannot_be_made(tmp_path: Path, folder: str) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="choose a folder"):
-        opened(tmp_path / folder)
-
-
-# ── kill -9 ──────────────────────────────────────────────────────────────────────────────────────────
-
-WRITER = """
-    import sys
-    from test_campaign_store import *
-    store = opened(sys.argv[1])
-    found = store.current() or store.begin("p", None)
-    state = {d.number: d.status for d in found.decisions}
-    print("open", *(f"{n}:{s}" for n, s in state.items()), flush=True)
-    k = len(state)
-    while True:
-        k += 1
-        d = decision(standstill(k))
-        number = store.record(found.number, d)
-        print(f"{number}:accepted", flush=True)
-        if k % 3 == 0:
-            store.decide(found.number, [replace(d, number=number).now("undone", "")])
-            print(f"{number}:undone", flush=True)
-"""
-
-
-def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
-    rng = random.Random(7)
-    told: dict[int, str] = {}
-    for _ in range(8):
-        with run_script(WRITER, tmp_path) as process:
-            assert process.stdout is not None
-            first = process.stdout.readline().split()[1:]
-            restored = {int(n): s for n, s in (word.split(":") for word in first)}
-            # At most the one step under way at the kill was committed without having been told.
-            news = set(restored.items()) - set(told.items())
-            assert len(news) <= 1 and set(told) <= set(restored)
-            assert all(restored[n] == s or restored[n] == "undone" for n, s in told.items())
-            told = restored
-            for _ in range(rng.randrange(1, 40)):
-                number, status = process.stdout.readline().strip().split(":")
-                told[int(number)] = status
-            process.kill()
-            for line in process.stdout:
-                if line.endswith("\n"):
-                    told[int(line.split(":")[0])] = line.strip().split(":")[1]
-    assert len(told) > 30
-    store = opened(tmp_path)
-    found = store.current()
-    store.close()
-    assert found is not None
-    for d in found.decisions:
-        assert_same(d, replace(decision(standstill(d.number)), number=d.number, status=d.status))
