@@ -34,6 +34,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from calib_planner.errors import CalibPlannerError, UnknownNameError
+from calib_planner.ros.lasting import LastingActionServer, lasting
 from calib_planner.ros.parameters import QOS, NodeParameters, parameter
 from calib_planner.ros.qos import overridable, own
 
@@ -239,6 +240,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         """As rclpy's; an exception in the callback is logged and answered."""
         made = super().create_service(srv_type, srv_name, self._safe_service(callback), **others)
         if self._made:
+            lasting(made)
             self._destroy_with(self.destroy_service, made)
         return made
 
@@ -262,7 +264,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self, kind: Any, name: str, execute: Callable[..., Any], **others: Any
     ) -> ActionServer:
         """An action server; ``execute`` answers its faults itself, since only it knows its result's words."""
-        made = ActionServer(self, kind, name, execute, **others)
+        made = LastingActionServer(self, kind, name, execute, **others)
         if self._made:
             self._destroy_with(made.destroy)
         return made

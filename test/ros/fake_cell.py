@@ -13,13 +13,14 @@ from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from geometry_msgs.msg import Point
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.node import Node
 
 from calib_planner import Robot
 from calib_planner.ros.conversions import plan_from_message
+from calib_planner.ros.lasting import LastingActionServer
 from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -50,7 +51,7 @@ class FakeCell(Node):
         self._estimates = self.create_publisher(CalibrationEstimate, "calibration_identifier/estimate", LATCHED)
         self.measurements = self.create_publisher(Measurement, "calibration_identifier/measurements", EVENTS)
         self.create_subscription(PlanMessage, "calibration_campaign/plan", self._on_plan, LATCHED)
-        self._server = ActionServer(
+        self._server = LastingActionServer(
             self,
             ExecutePlan,
             "tracker_simulator/execute_plan",
