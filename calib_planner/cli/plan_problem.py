@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib_planner.cli.arguments import (
     add_parameters,
     add_robot,
@@ -17,13 +19,15 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.conditions import add_conditions, conditions
+from calib_planner.cli.identify_options import TYPICAL
 from calib_planner.design.criteria import CRITERIA
 from calib_planner.design.discrepancy import ModelDiscrepancy
 from calib_planner.design.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.errors import InputError
 from calib_planner.files.configurations_csv import read_configurations
-from calib_planner.files.document import read_mapping
 from calib_planner.files.measurements_csv import read_measurements
+from calib_planner.files.prior_yaml import read_prior
+from calib_planner.identification.prior import typical_prior
 from calib_planner.robot.catalogue import URDF_SUFFIXES
 from calib_planner.robot.chain import Robot
 
@@ -52,7 +56,12 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
         help="error of one coordinate that repeating a configuration does not average away [m] (0)",
     )
     known = parser.add_argument_group("what is known beforehand")
-    known.add_argument("--prior", metavar="FILE", help="YAML: parameter name to standard deviation [m | rad]")
+    known.add_argument(
+        "--prior",
+        metavar="FILE",
+        help="YAML: parameter name to standard deviation [m | rad], or a prior as for identify, but no estimate; "
+        f"{TYPICAL}: the data sheet within usual manufacturing errors",
+    )
     known.add_argument("--measured", metavar="FILE", help="CSV of measurements already taken: plan the next ones")
     search = parser.add_argument_group("search")
     weight = DEFAULTS["general_weight"]
@@ -122,7 +131,7 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         compound=_compound(getattr(args, "compound", [])),
         general_weight=args.general_weight,
         configuration_sigma=args.configuration_sigma,
-        prior_std=_prior(args.prior),
+        prior_std=_prior(args.prior, robot),
         measured=_measured(args, robot),
         candidates=_candidates(args, robot),
         discrepancy=_discrepancy(args, robot),
@@ -154,8 +163,19 @@ def _compound(words: list[str]) -> dict[str, float]:
     return shares
 
 
-def _prior(path: str | None) -> dict[str, Any]:
-    return {} if path is None else read_mapping(path, "a YAML of parameter name: standard deviation")
+def _prior(given: str | None, robot: Robot) -> dict[str, float]:
+    """Standard deviations by parameter, of a file or of the typical prior."""
+    if given is None:
+        return {}
+    prior = typical_prior(robot) if given == TYPICAL else read_prior(given, robot).prior
+    if prior is None:
+        return {}
+    covariance = np.asarray(prior.covariance)
+    variances = np.diag(covariance)
+    if (covariance != np.diag(variances)).any():
+        got, valid = f"{given}, whose parameters err together", "independent standard deviations"
+        raise InputError("--prior", got, valid, "give the measurements of that estimate: --measured FILE")
+    return dict(zip(prior.names, np.sqrt(variances).tolist(), strict=True))
 
 
 def _measured(args: argparse.Namespace, robot: Robot) -> Any:

@@ -242,6 +242,28 @@ def test_next_configurations_after_measured_ones(call: Any, tmp_path: Path) -> N
     assert more["predicted_accuracy"] < first["predicted_accuracy"]
 
 
+def test_a_plan_takes_the_priors_of_identify(call: Any, tmp_path: Path) -> None:
+    short, long = str(tmp_path / "short.yaml"), str(tmp_path / "long.yaml")
+    Path(short).write_text("q1: 1.0e-4\nd2: 1.0e-3\n")
+    Path(long).write_text("parameters:\n  q1: {std: 0.1, unit: mrad, deviation: 1.0}\n  d2: {std: 1, unit: mm}\n")
+    sized = (*POSED, "--configurations", "4", "--starts", "2", "--json")
+    plain, a, b, usual = (
+        call("plan", *sized, *(() if p is None else ("--prior", p))) for p in (None, short, long, "typical")
+    )
+    assert a["predicted_accuracy"] == pytest.approx(b["predicted_accuracy"], rel=1e-12)
+    assert a["predicted_accuracy"] < plain["predicted_accuracy"]
+    assert usual["predicted_accuracy"] < plain["predicted_accuracy"]
+
+
+def test_an_estimate_is_no_prior_of_a_plan(call: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan, points, estimate = (str(tmp_path / n) for n in ("plan.yaml", "points.csv", "estimate.yaml"))
+    call("plan", *RADIANS, "--configurations", "5", "--output", plan, "--json")
+    call("simulate", "--robot", "kuka_kr270", "--plan", plan, "--output", points, "--json")
+    call("identify", "--robot", "kuka_kr270", "--data", points, "--output", estimate, "--json")
+    assert main(["plan", *RADIANS, "--configurations", "2", "--prior", estimate]) == 2
+    assert "--measured FILE" in capsys.readouterr().err
+
+
 def test_candidates(call: Any, tmp_path: Path) -> None:
     path = tmp_path / "pool.csv"
     robot = Robot.load("kuka_kr270")
