@@ -12,9 +12,13 @@ from calib_planner.instrument.standstill import NANO, StandstillDetector
 MANY = [*STOPS, *STOPS]
 
 
-@pytest.mark.parametrize("offset", [-0.4, -0.15, -0.02, 0.0, 0.02, 0.15, 0.4])
-@pytest.mark.parametrize("move", [0.5, 3.0])
-@pytest.mark.parametrize("rate", [50, 1000])
+OFFSETS = (-0.4, -0.15, -0.02, 0.0, 0.02, 0.15, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("offset", "move", "rate"),
+    [*((x, move, 50) for x in OFFSETS for move in (0.5, 3.0)), *((x, 0.5, 1000) for x in OFFSETS[::3])],
+)
 def test_an_offset_is_found(offset: float, move: float, rate: int) -> None:
     detector = StandstillDetector(2)
     feed(detector, stream(MANY, 1, offset, point_rate=rate, move=move), flush=False)
