@@ -135,7 +135,7 @@ class Measuring:
             self.visit = visit = Visit(action, time.monotonic())
             self._wait_for("")
         if visit.phase == "moving":
-            if self._execution.accepted:
+            if self._execution.begun:
                 self._wait_for("")
             return state if ended is None else self._moved(state, visit, ended)
         if self._execution.busy:

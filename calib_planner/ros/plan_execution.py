@@ -15,7 +15,6 @@ from typing import Any
 from action_msgs.srv import CancelGoal
 from calib_planner_msgs.action import ExecutePlan
 from rclpy.action import ActionClient
-from rclpy.action.client import ClientGoalHandle
 from unique_identifier_msgs.msg import UUID
 
 from calib_planner.ros.lifecycle import ManagedNode
@@ -25,12 +24,13 @@ RESULTS = {
     ExecutePlan.Result.INVALID_PLAN: "refused",
     ExecutePlan.Result.CANCELLED: "cancelled",
     ExecutePlan.Result.ABORTED: "aborted",
+    ExecutePlan.Result.BUSY: "busy",
 }
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a goal ended: a value of ``RESULTS``, ``busy`` (it was not accepted) or ``lost``; and why."""
+    """How a goal ended: a value of ``RESULTS`` (``busy`` also if it was not accepted) or ``lost``; and why."""
 
     how: str
     message: str
@@ -45,10 +45,9 @@ class PlanExecution:
         self._canceller = node.create_client(CancelGoal, f"{action}/_action/cancel_goal")
         self.action = action
         self._goal: UUID | None = None
-        self._handle: ClientGoalHandle | None = None
         self._ended: Ended | None = None
         self._heard = 0.0
-        self._cancelling = False
+        self._begun = self._cancelling = False
 
     @property
     def ready(self) -> bool:
@@ -61,16 +60,16 @@ class PlanExecution:
         return self._goal is not None
 
     @property
-    def accepted(self) -> bool:
-        """Whether the robot has said that it does it."""
-        return self._handle is not None
+    def begun(self) -> bool:
+        """Whether the robot has told how far it is; to accept a goal is not to do it."""
+        return self._begun
 
     def send(self, goal: ExecutePlan.Goal) -> None:
         """Begin; the one before must have ended."""
         name = UUID(uuid=list(uuid.uuid4().bytes))
-        self._goal, self._handle, self._ended, self._cancelling = name, None, None, False
+        self._goal, self._ended, self._begun, self._cancelling = name, None, False, False
         self._heard = time.monotonic()
-        sent = self._client.send_goal_async(goal, lambda _: self._alive(name), goal_uuid=name)
+        sent = self._client.send_goal_async(goal, lambda _: self._alive(name, begun=True), goal_uuid=name)
         sent.add_done_callback(lambda future: self._answered(name, future))
 
     def cancel(self) -> None:
@@ -88,12 +87,13 @@ class PlanExecution:
             self._ended = Ended("lost", f"nothing heard from {self.action} for {silence:g} s")
         ended = self._ended
         if ended is not None:
-            self._goal = self._ended = self._handle = None
+            self._goal = self._ended = None
         return ended
 
-    def _alive(self, name: UUID) -> None:
+    def _alive(self, name: UUID, begun: bool = False) -> None:
         if name is self._goal:
             self._heard = time.monotonic()
+            self._begun |= begun
 
     def _answered(self, name: UUID, future: Any) -> None:
         if name is not self._goal:
@@ -103,7 +103,6 @@ class PlanExecution:
         if handle is None or not handle.accepted:
             self._ended = Ended("busy", f"{self.action} did not accept the goal")
             return
-        self._handle = handle
         handle.get_result_async().add_done_callback(lambda result: self._finished(name, result))
 
     def _finished(self, name: UUID, future: Any) -> None:

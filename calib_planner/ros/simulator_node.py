@@ -129,7 +129,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         result = ExecutePlan.Result()
         if not self._busy.acquire(blocking=False):
             goal.abort()
-            result.status = ExecutePlan.Result.ABORTED
+            result.status = ExecutePlan.Result.BUSY
             result.message = "another plan is being executed: wait for it or cancel it"
             return result
         try:

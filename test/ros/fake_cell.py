@@ -25,13 +25,15 @@ from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 Answer = Callable[[np.ndarray], str]
+KIND = ExecutePlan.Result
+STATUS = {"refuse": KIND.INVALID_PLAN, "abort": KIND.ABORTED, "busy": KIND.BUSY}
 
 
 class FakeCell(Node):
     """``answer`` says what becomes of a configuration (joints,):
 
-    ``ok``, ``refuse`` (INVALID_PLAN), ``abort``, ``reject`` (measured, not accepted), ``ignore`` (nothing is
-    published), ``hang`` (no end and no feedback until cancelled).
+    ``ok``, ``refuse`` (INVALID_PLAN), ``abort``, ``busy``, ``reject`` (measured, not accepted), ``ignore``
+    (nothing is published), ``hang`` (no end and no feedback until cancelled).
     """
 
     THREADS = 3
@@ -81,10 +83,9 @@ class FakeCell(Node):
             if goal.is_cancel_requested:
                 goal.canceled()
             return kind(status=kind.CANCELLED, message="stopped on request")
-        if answer in ("refuse", "abort"):
+        if answer in STATUS:
             goal.abort()
-            status = kind.INVALID_PLAN if answer == "refuse" else kind.ABORTED
-            return kind(status=status, message=f"cannot go there: {answer}")
+            return kind(status=STATUS[answer], message=f"cannot go there: {answer}")
         if answer != "ignore":
             self.publish(q, accepted=answer == "ok")
         goal.succeed()

@@ -291,6 +291,26 @@ def test_a_robot_that_hangs_is_cancelled_and_tried_again(bench: Bench, cell: Fak
     np.testing.assert_array_equal(cell.visited[2], cell.visited[3])
 
 
+def test_a_robot_that_is_busy_is_waited_for(bench: Bench, cell: FakeCell) -> None:
+    """It accepts goals all the same, and says so in the result, as the simulator does."""
+    busy = {"on": True}
+    cell.answer = lambda q: "busy" if busy["on"] and len(cell.visited) > 3 else "ok"
+    desk = Desk(bench, longest_wait=3.0)
+    assert desk.call("start")[0]
+    waiting = desk.until(S.WAITING)
+    assert "cannot go there: busy" in waiting.reason and waiting.measured == 3 and waiting.excluded == 0
+    paused = desk.until(S.PAUSED)
+    assert "cannot go there: busy" in paused.reason
+    assert {m.state for m in desk.heard[desk.heard.index(waiting) : desk.heard.index(paused)]} == {S.WAITING}
+    tried = cell.visited[3:]
+    assert 2 <= len(tried) <= 4
+    np.testing.assert_array_equal(tried, [tried[0]] * len(tried))
+    busy["on"] = False
+    assert desk.call("resume")[0]
+    done = desk.until(S.DONE)
+    assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
+
+
 def test_an_identifier_that_says_nothing_uses_up_attempts_not_the_campaign(bench: Bench, cell: FakeCell) -> None:
     cell.answer = lambda q: "ignore" if len(cell.visited) in (2, 3) else "ok"
     desk = Desk(bench, patience=0.3)

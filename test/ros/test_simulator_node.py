@@ -97,7 +97,7 @@ def test_one_execution_at_a_time_and_cancel(bench: Bench, planned: Plan) -> None
     bench.wait(lambda: feedback)
     second = bench.goal(client, goal_of(planned))
     refused = bench.future(second.get_result_async()).result
-    assert refused.status == Result.ABORTED and "another plan" in refused.message
+    assert refused.status == Result.BUSY and "another plan" in refused.message
     bench.future(first.cancel_goal_async())
     result = bench.future(first.get_result_async())
     assert result.status == GoalStatus.STATUS_CANCELED
