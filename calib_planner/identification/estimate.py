@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from calib_planner._arrays import FloatArray, check_configurations, frozen
 from calib_planner.design.plan import plain
+from calib_planner.identification.hidden_errors import HiddenErrors
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.order_check import Disturbance
 from calib_planner.identification.structure import Structure
@@ -60,6 +61,8 @@ class Validation:
         within_95: Share of the points inside their 95 % region; NaN where it was not predicted.
         geometry_mean, geometry_rms: With the geometric parameters alone, without joint corrections.
         folds: Parts of a cross-validation; 0: held-out data.
+        noise_rms: What the measurement of these points alone adds to rms; NaN where it cannot be told from the
+            robot, or was not predicted.
     """
 
     count: int
@@ -73,6 +76,17 @@ class Validation:
     geometry_mean: float = float("nan")
     geometry_rms: float = float("nan")
     folds: int = 0
+    noise_rms: float = float("nan")
+
+    @property
+    def robot_rms(self) -> float:
+        """What the robot is off at least: rms less the measurement's part and two standard deviations of that
+        (see ``adaptive.requirement``); all of rms where the measurement's part is not known [m].
+        """
+        if not np.isfinite(self.noise_rms):
+            return self.rms
+        noise = self.noise_rms**2 * (1.0 + 2.0 * np.sqrt(2.0 / (3.0 * self.count)))
+        return float(np.sqrt(max(self.rms**2 - noise, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -136,6 +150,8 @@ class Estimate:
         disturbances: What seems to have moved during the campaign; see ``order_check``.
         moved_since: First row of those at the end that were all rejected, or ``None``.
         transmission: The complete model with the joints' own errors, if the data show them; else ``None``.
+        hidden: Errors of the joints that the data would not show, and what they would do; ``None`` where it was
+            not asked or errors were learnt.
         starts, agreeing_starts: Other starts made, and those that ended in the same minimum.
         iterations: Iterations of the last fit.
         status: A key of ``STATUS``.
@@ -182,6 +198,7 @@ class Estimate:
     disturbances: tuple[Disturbance, ...]
     moved_since: int | None
     transmission: Transmission | None
+    hidden: HiddenErrors | None
     starts: int
     agreeing_starts: int
     iterations: int
@@ -286,6 +303,7 @@ class Estimate:
             "disturbances": [asdict(d) for d in self.disturbances],
             "moved_since": self.moved_since,
             "joint_corrections": None if self.transmission is None else self.transmission.to_dict(),
+            "hidden_joint_errors": None if self.hidden is None else vars(self.hidden),
             "starts": self.starts,
             "agreeing_starts": self.agreeing_starts,
             "iterations": self.iterations,

@@ -17,6 +17,7 @@ from calib_planner.identification.estimate import (
     Estimate,
     residual_statistics,
 )
+from calib_planner.identification.hidden_errors import HiddenErrors
 from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import NoiseLevels
@@ -53,6 +54,7 @@ class Evidence:
     disturbances: tuple[Disturbance, ...]
     moved_since: int | None
     transmission: Transmission | None
+    hidden: HiddenErrors | None
     at: FloatArray
     jacobian: FloatArray
     starts: int
@@ -117,6 +119,7 @@ def estimate_of(evidence: Evidence) -> Estimate:
         disturbances=evidence.disturbances,
         moved_since=evidence.moved_since,
         transmission=evidence.transmission,
+        hidden=evidence.hidden,
         starts=evidence.starts,
         agreeing_starts=evidence.agreeing,
         iterations=fit.iterations,

@@ -6,7 +6,8 @@
 4. how much    the paper's iteration (``least_squares``) with weights (``weighing``): a fit that measurement noise
                does not explain gets a discrepancy, and new weights, before 3 is looked at again
 5. how sure    other starts must end in the same place; cov(Π̂) of eq. (11) with the final weights
-6. what else   residuals that know where the robot stood: errors of the joints (``transmission``)
+6. what else   residuals that know where the robot stood: errors of the joints (``transmission``), and those that
+               the residuals could not show (``hidden_errors``)
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from calib_planner._arrays import FloatArray
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.evidence import Evidence, estimate_of
+from calib_planner.identification.hidden_errors import HiddenErrors, hidden_errors
 from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.noise_levels import improbable
@@ -99,6 +101,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         disturbances=_disturbances(work, found),
         moved_since=rejected_since(problem.data.seen, found.equations.use),
         transmission=transmission,
+        hidden=_hidden(work, found, transmission),
         starts=starts,
         agreeing=agreeing,
         seconds=time.perf_counter() - began,
@@ -251,6 +254,14 @@ def _covariance(work: Work, found: Weighed, transmission: Transmission | None) -
     if transmission is None:
         return found.covariance
     return geometry_covariance(transmission, found.equations, found.fit, _instrument(work, found), work.labels)
+
+
+def _hidden(work: Work, found: Weighed, transmission: Transmission | None) -> HiddenErrors | None:
+    """Errors of the joints that the data would not have shown, where none were learnt."""
+    if work.problem.joint_corrections == "off" or transmission is not None or not found.fit.converged:
+        return None
+    white = wholly_whitened(found.equations, work.instrument, found.levels, work.labels)
+    return hidden_errors(found.equations, white, found.fit, found.levels, work.problem.test_pose_array)
 
 
 def _disturbances(work: Work, found: Weighed) -> tuple[Disturbance, ...]:

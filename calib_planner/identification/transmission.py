@@ -100,7 +100,7 @@ class Transmission:
     def columns(self, q: FloatArray) -> FloatArray:
         """∂positions/∂(``names``, coefficients) in the order of ``covariance``: (N, targets, 3, …)."""
         kept = [self.robot.parameter_names.index(n) for n in self.names]
-        return _columns(self.robot, self.corrections, q, kept)
+        return model_columns(self.robot, self.corrections, q, kept)
 
     def remainder(self, q: FloatArray) -> FloatArray:
         """Covariance of what even this model does not hold: (N, targets, 3, 3) [m²]."""
@@ -171,12 +171,9 @@ def geometry_covariance(
             weighted[index[:, 0]] = factor * whitened[index[:, 0]]
         else:
             weighted[index] = np.swapaxes(factor, 1, 2) @ whitened[index]
-    waves = _columns(transmission.robot, transmission.corrections, data.q, [])[use].reshape(count, -1)
-    spread = np.sqrt(
-        np.ravel(
-            _variances(transmission.length, transmission.amplitude, np.asarray(transmission.corrections.scale))
-        )
-    )
+    waves = model_columns(transmission.robot, transmission.corrections, data.q, [])[use].reshape(count, -1)
+    scale = np.asarray(transmission.corrections.scale)
+    spread = np.sqrt(np.ravel(prior_variances(transmission.length, transmission.amplitude, scale)))
     shared = weighted.T @ (waves * np.tile(spread, 2))
     middle = prior.T @ prior + shared @ shared.T
     model = DiscrepancyModel.of(equations, instrument, labels)
@@ -191,7 +188,7 @@ def geometry_covariance(
     return np.asarray(covariance @ middle @ covariance)
 
 
-def _variances(length: float, amplitude: float, scale: FloatArray) -> FloatArray:
+def prior_variances(length: float, amplitude: float, scale: FloatArray) -> FloatArray:
     """(joints, harmonics) prior variances of the coefficients."""
     return np.asarray(amplitude**2 * spectrum(length) / scale[:, None] ** 2)
 
@@ -345,7 +342,7 @@ def _fit(
     for _ in range(2):
         corrections = JointCorrections(robot.joint_names, scale, shift, *coefficients)
         here = robot.with_deviations(dict(zip(robot.parameter_names, total, strict=True)))
-        rows = _columns(here, corrections, data.q, columns)
+        rows = model_columns(here, corrections, data.q, columns)
         residuals = (data.p - here.positions(corrections.actual(data.q)))[use].ravel()
         extra, right = equations.prior_rows(total)
         design = whitening.apply(rows[use].reshape(len(residuals), -1))
@@ -376,7 +373,7 @@ def _fit(
     )
 
 
-def _columns(robot: Robot, corrections: JointCorrections, q: FloatArray, kept: list[int]) -> FloatArray:
+def model_columns(robot: Robot, corrections: JointCorrections, q: FloatArray, kept: list[int]) -> FloatArray:
     """∂p/∂(parameters kept, cosines, sines): (N, targets, 3, …)."""
     actual = corrections.actual(q)
     x = (q - np.asarray(corrections.shift)) * np.asarray(corrections.scale)
@@ -384,7 +381,7 @@ def _columns(robot: Robot, corrections: JointCorrections, q: FloatArray, kept: l
     waves = harmonics(x, np.shape(corrections.cosines)[1])
     parts = [(levers[..., None] * w[:, None]).reshape(*levers.shape[:2], -1) for w in waves]
     columns = np.concatenate([robot.jacobian(actual)[:, :, kept], *parts], axis=2)
-    return columns.reshape(len(q), len(robot.targets), 3, -1)
+    return columns.reshape(len(q), len(robot.targets), 3, columns.shape[2])
 
 
 def _levers(robot: Robot, q: FloatArray) -> FloatArray:

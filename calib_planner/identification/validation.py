@@ -201,10 +201,13 @@ def _models(estimate: Estimate) -> tuple[_Model, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Prediction:
-    """(points, 3) measured − predicted and (points, 3, 3) what it should scatter like."""
+    """(points, 3) measured − predicted, (points, 3, 3) what it should scatter like, (points, 3) variance of the
+    measurement alone, NaN where that is not known.
+    """
 
     residuals: FloatArray
     covariance: FloatArray
+    measured: FloatArray
 
 
 def _predict(model: _Model, seat: Measurements, rest: Measurements) -> _Prediction:
@@ -217,12 +220,14 @@ def _predict(model: _Model, seat: Measurements, rest: Measurements) -> _Predicti
     elif len(robot.targets) < targets:
         raise InputError("validation data", f"{targets} targets", f"at most {len(robot.targets)} targets")
     model = model.with_targets(robot.target_offsets[:targets])
-    columns, error = model.columns(rest.q), _noise(model, rest)
+    columns, error, measured = model.columns(rest.q), _noise(model, rest), _measured(model, rest)
+    if model.estimate.noise.source == "residuals":  # the robot's own scatter may be part of it
+        measured = np.full_like(measured, np.nan)
     if len(seat):
         columns, error = _with_seat(model, seat, rest, columns, error)
     points = model.robot.positions(model.actual(rest.q))
     covariance = columns @ model.covariance() @ np.swapaxes(columns, 2, 3) + error
-    return _Prediction((rest.p - points)[rest.seen], covariance[rest.seen])
+    return _Prediction((rest.p - points)[rest.seen], covariance[rest.seen], measured[rest.seen])
 
 
 def _with_seat(
@@ -248,13 +253,18 @@ def _with_seat(
 
 def _noise(model: _Model, data: Measurements) -> FloatArray:
     """D + R of each point: (N, targets, 3, 3) [m²]."""
+    return model.discrepancy(data.q) + _measured(model, data)[..., None] * np.eye(3)
+
+
+def _measured(model: _Model, data: Measurements) -> FloatArray:
+    """Diagonal of R, variances of the measurement: (N, targets, 3) [m²]."""
     levels = model.estimate.noise
     measured = np.full(data.p.shape, 0.0 if levels.source == "residuals" else levels.measurement)
     if levels.source == "residuals" and model.estimate.transmission is None:
         measured = np.full(data.p.shape, levels.measurement)
     if data.std is not None and levels.source == "data":
         measured = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0) * levels.scaled
-    return model.discrepancy(data.q) + measured[..., None] ** 2 * np.eye(3)
+    return measured**2
 
 
 def _statistics(parts: list[list[_Prediction]]) -> Validation:
@@ -269,6 +279,7 @@ def _statistics(parts: list[list[_Prediction]]) -> Validation:
     if not len(best):
         raise NotEnoughDataError(0, 1, "the validation data hold no measured point")
     known = bool(np.isfinite(covariance).all())
+    noise = np.concatenate([p[0].measured for p in parts])
     inside = normalised(residuals, covariance) <= INSIDE if known else np.array([np.nan])
     return Validation(
         count=len(best),
@@ -281,6 +292,7 @@ def _statistics(parts: list[list[_Prediction]]) -> Validation:
         within_95=float(np.mean(inside)),
         geometry_mean=float(geometry.mean()),
         geometry_rms=float(np.sqrt(np.mean(geometry**2))),
+        noise_rms=float(np.sqrt(np.mean(np.sum(noise, axis=1)))),
     )
 
 

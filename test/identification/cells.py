@@ -16,6 +16,26 @@ LENGTH, ANGLE = 5e-4, 1e-3
 TARGETS = np.array([[0.05, 0.02, 0.12], [-0.06, 0.04, 0.10], [0.01, -0.07, 0.14]])
 
 
+POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
+ROUND = POSE + 1e-3 * np.array(
+    [
+        [-3, 78, -135, -5, 86, 0],
+        [10, 64, -118, -1, 85, 0],
+        [-9, 60, -115, -2, 87, 0],
+        [-24, 58, -107, -4, 83, 0],
+        [-16, 59, -117, -6, 80, 0],
+        [-2, 54, -117, -2, 85, 0],
+        [17, 39, -82, -7, 76, 0],
+        [-10, 30, -69, 0, 78, 0],
+        [8, 26, 330, 13, -2, 0],
+        [18, 15, 44, 291, -281, 0],
+        [0, -80, 203, -302, -332, 0],
+        [-14, -370, 236, 10, 15, 0],
+    ]
+)
+"""What the planner chooses for the test pose ``POSE``, to the milliradian."""
+
+
 def bare(data: Measurements, points: np.ndarray | None = None) -> Measurements:
     """Without standard deviations, and with other points if given."""
     return Measurements(data.joint_names, data.q, data.p if points is None else points)
