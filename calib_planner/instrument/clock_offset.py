@@ -9,7 +9,9 @@ as quick at its end as at its beginning, so the middles differ by τ and the len
 
 The offset of a target is the median of its last standstills. A beam that was broken shortens the target's
 interval and shows as doubt, a target that did not move at all has none. An offset shorter than the time left out
-after coming to rest does no harm to means over standstills; a longer one pairs points with the wrong joints.
+after coming to rest does no harm to means over standstills. With a longer one they may hold ends of motions, as
+far as the tolerance of standing still lets them, or points of another standstill than the joints. Some such means
+were taken before an offset is seen: ``beyond`` names them.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class ClockOffsets:
     shortest: int
     _joints: deque[Interval] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _points: list[deque[Interval]] = field(default_factory=list)
-    _found: list[deque[Interval]] = field(default_factory=list)  # (offset, doubt) [ns]
+    _found: list[deque[tuple[int, int, Interval]]] = field(default_factory=list)  # (offset, doubt, joints) [ns]
 
     def __post_init__(self) -> None:
         self.clear()
@@ -92,8 +94,15 @@ class ClockOffsets:
         found = self._found[target]
         if len(found) < FEWEST:
             return None
-        seconds, doubt = (median(f[i] for f in found) / NANO for i in (0, 1))
+        seconds, doubt = (median(values) / NANO for values in list(zip(*found, strict=True))[:2])
         return Offset(seconds, doubt, len(found))
+
+    def beyond(self, target: int, bound: float) -> list[Interval]:
+        """Rests of the joints [ns] whose points had an offset beyond ``bound`` [s], once the offset itself is."""
+        now = self.offset(target)
+        if now is None or not now.exceeds(bound):
+            return []
+        return [rest for offset, doubt, rest in self._found[target] if abs(offset) - doubt > bound * NANO]
 
     def _nearest(self, rest: Interval, others: deque[Interval]) -> Interval | None:
         """Which of the other stream's rests belongs to ``rest``."""
@@ -103,4 +112,4 @@ class ClockOffsets:
     def _note(self, target: int, joints: Interval, points: Interval) -> None:
         offset = (sum(points) - sum(joints)) // 2
         doubt = abs((points[1] - points[0]) - (joints[1] - joints[0])) // 2
-        self._found[target].append((offset, doubt))
+        self._found[target].append((offset, doubt, joints))

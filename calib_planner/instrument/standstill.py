@@ -5,9 +5,10 @@ tolerance, and no gap between messages is longer than allowed. Velocities play n
 missing, noisy or zero at turning points), nor do arrival times: all that counts is the stamps, integer
 nanoseconds.
 
-The average begins ``settle`` after the joints came to rest, at the earliest when the points did too. A result
-comes once per standstill: as soon as there are enough samples; after ``patience`` with what there is; or when
-the robot moves on. A standstill that ends without a result gives a rejection that says why.
+The average begins ``settle`` after the joints came to rest, and as long after the points did: the end of a motion
+is within the tolerance, and were the tracker's clock ahead, the joints' rest alone would not leave it out. A
+result comes once per standstill: as soon as there are enough samples; after ``patience`` with what there is; or
+when the robot moves on. A standstill that ends without a result gives a rejection that says why.
 
 The tolerance on points has to be several times the tracker's noise: with σ = 0.03 mm the range of a thousand
 samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do as well as live ones.
@@ -15,8 +16,7 @@ samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do 
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from enum import Enum
 
 import numpy as np
@@ -25,11 +25,10 @@ from numpy.typing import ArrayLike
 from calib_planner._arrays import FloatArray, IntArray, check_array, check_count, check_number, frozen
 from calib_planner.errors import InputError
 from calib_planner.instrument.clock_offset import ClockOffsets
+from calib_planner.instrument.rest_window import MOST_SAMPLES, RestWindow
 from calib_planner.instrument.stamp_order import StampOrder
 
 NANO = 1_000_000_000
-MOST_SAMPLES = 20_000
-"""Samples of one stream kept at most."""
 IN_A_ROW = 50
 """Unusable messages in a row that are worth a rejection of their own."""
 
@@ -79,6 +78,7 @@ class Reason(Enum):
     MOVED = "moved"
     TOO_FEW_SAMPLES = "too_few_samples"
     TIME_SKEW = "time_skew"
+    OTHER_FRAME = "other_frame"
     NOT_FINITE = "not_finite"
 
 
@@ -133,50 +133,6 @@ class Rejection:
     samples: IntArray
 
 
-@dataclass
-class _Window:
-    """The samples of one stream since it came to rest, the oldest forgotten beyond ``horizon`` [ns]."""
-
-    tolerance: float
-    gap: int
-    horizon: int
-    since: int = 0
-    last: int = 0
-    moved_by: float = 0.0
-    samples: deque[tuple[int, FloatArray]] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
-    _low: FloatArray = field(default_factory=lambda: np.empty(0))
-    _high: FloatArray = field(default_factory=lambda: np.empty(0))
-
-    def on_time(self, stamp: int) -> bool:
-        """Whether ``stamp`` follows the last sample without a gap."""
-        return bool(self.samples) and 0 < stamp - self.last <= self.gap
-
-    def spread_with(self, value: FloatArray) -> float:
-        """Range, largest over the coordinates, were ``value`` to join."""
-        return float(np.max(np.maximum(self._high, value) - np.minimum(self._low, value)))
-
-    def push(self, stamp: int, value: FloatArray) -> tuple[int, int] | None:
-        """Take a sample; one that breaks the rest begins a new one, and gives the old one's interval [ns]."""
-        ended = None
-        if self.on_time(stamp) and self.spread_with(value) <= self.tolerance:
-            self._low, self._high = np.minimum(self._low, value), np.maximum(self._high, value)
-        else:
-            ended = (self.since, self.last) if self.samples else None
-            self.samples.clear()
-            self._low = self._high = value
-            self.since = stamp
-        self.last = stamp
-        self.samples.append((stamp, value))
-        while self.samples[0][0] < stamp - self.horizon:
-            self.samples.popleft()
-        return ended
-
-    def between(self, start: int, stop: int) -> FloatArray:
-        """(samples, n) values with stamps in [start, stop]."""
-        rows = [v for t, v in self.samples if start <= t <= stop]
-        return np.array(rows).reshape(len(rows), len(self._low))
-
-
 class StandstillDetector:
     """Fed with stamped messages in any order; returns what they complete.
 
@@ -192,14 +148,15 @@ class StandstillDetector:
         self.target_count = check_count("targets", targets, high=1000)
         self._order: StampOrder[FloatArray] = StampOrder(1 + targets, _ns(s.window), _ns(s.skew))
         horizon, gap = _ns(s.settle + max(s.patience, s.duration) + s.gap), _ns(s.gap)
-        self._joints = _Window(s.joint_tolerance, gap, horizon)
-        self._targets = [_Window(s.point_tolerance, gap, horizon) for _ in range(targets)]
+        self._joints = RestWindow(s.joint_tolerance, gap, horizon)
+        self._targets = [RestWindow(s.point_tolerance, gap, horizon) for _ in range(targets)]
         self.clocks = ClockOffsets(targets, _ns(s.skew), _ns(s.duration) // 2)
         self._measured: FloatArray | None = None
         self._rest = (0, 0)  # stamps of the rest in which something was measured, so far
         self._complained = False
         self._saw_nan = False
         self._nan_in_a_row = [0] * (1 + targets)
+        self._complained_at = [-(2**63)] * (1 + targets)  # about a stream, stamps [ns]
 
     def add_joints(self, stamp: int, positions: ArrayLike) -> list[Standstill | Rejection]:
         """Take joint positions (joints,) [rad | m] with their stamp [ns]; NaN = unusable."""
@@ -231,6 +188,10 @@ class StandstillDetector:
                 return f"{text}, {by}, {1e3 * bound:.0f} ms are allowed: synchronise the clocks"
         return ""
 
+    def misdated(self, bound: float) -> list[tuple[int, int]]:
+        """Rests of the joints [ns] with a target's stamps more than ``bound`` [s] off, see ``ClockOffsets``."""
+        return [rest for k in range(self.target_count) for rest in self.clocks.beyond(k, bound)]
+
     @property
     def dropped(self) -> tuple[int, ...]:
         """Finite messages that took no part, joints first, then each target: too late, twice or set back."""
@@ -239,20 +200,34 @@ class StandstillDetector:
     # ── from messages to events in order ─────────────────────────────────────────────────────────────
 
     def _add(self, stream: int, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
-        stamp, name = int(stamp), f"target {stream}" if stream else "the joints"
+        stamp = int(stamp)
         if not np.isfinite(value).all():
             self._saw_nan = True
             self._nan_in_a_row[stream] += 1
-            if self._nan_in_a_row[stream] != IN_A_ROW:
-                return []
-            text = f"{IN_A_ROW} messages in a row from {name} are not finite: check line of sight and driver"
-            return [self._rejection(stamp, stamp, Reason.NOT_FINITE, text)]
+            text = f"{self._nan_in_a_row[stream]} messages in a row from {_name(stream)} are not finite"
+            text += ": check line of sight and driver"
+            bad = self._nan_in_a_row[stream] >= IN_A_ROW
+            return self._complaint(stream, stamp, Reason.NOT_FINITE, text) if bad else []
         self._nan_in_a_row[stream] = 0
-        if not self._order.add(stream, stamp, value) and self._order.late(stream) == IN_A_ROW:
-            lag = self._order.lag(stream) / NANO
-            text = f"stamps from {name} lie {lag:.3g} s behind the others: synchronise the clocks"
-            return [self._rejection(stamp, stamp, Reason.TIME_SKEW, text)]
+        if not self._order.add(stream, stamp, value) and self._lags(stream):
+            return self._complaint(stream, stamp, Reason.TIME_SKEW, self._lag_text(stream))
         return self._process()
+
+    def _complaint(self, stream: int, stamp: int, reason: Reason, text: str) -> list[Standstill | Rejection]:
+        """A rejection about a stream, as often as there could have been a standstill."""
+        before = self._complained_at[stream]
+        if before <= stamp <= before + _ns(self.settings.patience):
+            return []
+        self._complained_at[stream] = stamp
+        return [self._rejection(stamp, stamp, reason, text)]
+
+    def _lags(self, stream: int) -> bool:
+        """Whether a stream lies so far behind the others that it takes no part."""
+        return self._order.late(stream) >= IN_A_ROW
+
+    def _lag_text(self, stream: int) -> str:
+        text = f"stamps from {_name(stream)} lie {self._order.lag(stream) / NANO:.3g} s behind the others"
+        return f"{text}: synchronise the clocks, or raise skew if its messages take that long"
 
     def _process(self, *, everything: bool = False) -> list[Standstill | Rejection]:
         results: list[Standstill | Rejection] = []
@@ -304,7 +279,7 @@ class StandstillDetector:
             return []
         stop = min(stamp, joints.last)
         if all(len(w.samples) >= s.samples and stop - w.last <= w.gap for w in self._targets):
-            start = max(begin, *(w.since for w in self._targets))
+            start = max(begin, *(w.settled(_ns(s.settle)) for w in self._targets))
             if stop - start >= _ns(s.duration):
                 found = self._average(start, stop, s.samples)
                 if found is not None and (found.samples >= s.samples).all():
@@ -322,8 +297,8 @@ class StandstillDetector:
         return self._what_there_is(begin, stop)
 
     def _what_there_is(self, begin: int, stop: int) -> list[Standstill | Rejection]:
-        least = self.settings.minimum_samples
-        starts = [max(begin, w.since) for w in self._targets if len(w.samples) >= least]
+        least, settle = self.settings.minimum_samples, _ns(self.settings.settle)
+        starts = [max(begin, w.settled(settle)) for w in self._targets if len(w.samples) >= least]
         found = self._average(max(starts), stop, least) if starts else None
         if found is not None and 2 * (found.stop - found.start) >= _ns(self.settings.duration):
             return self._take(found)
@@ -366,14 +341,22 @@ class StandstillDetector:
                 Reason.MOVED,
                 f"the robot moved on {(stop - begin) / NANO:.2f} s after settling: dwell longer",
             )
-        most = max(len(w.between(begin, stop)) for w in self._targets)
-        text = f"{most} points in {(stop - begin) / NANO:.2f} s, at least {self.settings.minimum_samples} needed"
+        behind = next((k for k in range(1, 1 + self.target_count) if self._lags(k)), None)
+        if behind is not None:
+            return Reason.TIME_SKEW, self._lag_text(behind)
+        s, most = self.settings, max(len(w.between(begin, stop)) for w in self._targets)
+        text = f"{most} points in {(stop - begin) / NANO:.2f} s without a pause over {s.gap:g} s"
+        text += f", at least {s.minimum_samples} needed"
         return Reason.TOO_FEW_SAMPLES, f"{text}: check the tracker, its topic and its rate, or dwell longer"
 
     def _rejection(self, start: int, stop: int, reason: Reason, message: str) -> Rejection:
         last = self._joints.samples[-1][1] if self._joints.samples else np.full(self.joint_count, np.nan)
         samples = np.array([len(w.between(start, stop)) if w.samples else 0 for w in self._targets])
         return Rejection(start, stop, reason, message, frozen(last), frozen(samples))
+
+
+def _name(stream: int) -> str:
+    return f"target {stream}" if stream else "the joints"
 
 
 def _ns(seconds: float) -> int:

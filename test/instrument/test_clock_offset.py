@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_standstill import STOPS, feed, stream
+from test_standstill import STOPS, feed, place, stream
 
 from calib_planner.instrument.clock_offset import FEWEST, ClockOffsets
-from calib_planner.instrument.standstill import NANO, StandstillDetector
+from calib_planner.instrument.standstill import NANO, Standstill, StandstillDetector
 
 MANY = [*STOPS, *STOPS]
 
@@ -83,3 +83,40 @@ def test_synchronised_again_it_recovers() -> None:
         clocks.add_joints(4 * k * NANO, (4 * k + 1) * NANO)
         found = clocks.offset(0)
         assert found is None or found.exceeds(0.1) == (k < 14)
+
+
+def test_rests_that_had_the_offset_are_named_and_no_others() -> None:
+    clocks = ClockOffsets(1, NANO, 0)
+    rests = [(4 * k * NANO, (4 * k + 1) * NANO) for k in range(12)]
+    shifts = [0 if k < 4 else NANO // 3 for k in range(12)]
+    for k, (rest, shift) in enumerate(zip(rests, shifts, strict=True)):
+        clocks.add_point(0, rest[0] + shift, rest[1] + shift)
+        clocks.add_joints(*rest)
+        found = clocks.offset(0)
+        noticed = found is not None and found.exceeds(0.1)
+        assert noticed == (k >= 7)
+        assert clocks.beyond(0, 0.1) == (rests[4 : k + 1] if noticed else [])
+
+
+def test_a_doubtful_rest_is_not_named() -> None:
+    clocks = ClockOffsets(1, NANO, 0)
+    for k in range(5):
+        start, stop = (NANO // 2, 0) if k == 2 else (NANO // 5, NANO // 5)  # the third: a broken beam
+        clocks.add_point(0, 4 * k * NANO + start, (4 * k + 1) * NANO + stop)
+        clocks.add_joints(4 * k * NANO, (4 * k + 1) * NANO)
+    assert [start // (4 * NANO) for start, _ in clocks.beyond(0, 0.1)] == [0, 1, 3, 4]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.15, 0.3, 0.45])
+def test_ends_of_motions_are_left_out_whatever_the_offset(offset: float) -> None:
+    """Points without noise: what a mean is off by comes from motion; 0.02 mm were it not left out."""
+    ahead = round(offset * NANO)
+    exact = [
+        (t + ahead, k, np.array([place(t / NANO, MANY), 0.0, 1.0])) if k else (t, k, v)
+        for t, k, v in stream(MANY)
+    ]
+    results = feed(StandstillDetector(2), sorted(exact, key=lambda m: m[0]))
+    assert len(results) >= len(MANY) - 1
+    for found in results:
+        assert isinstance(found, Standstill)
+        assert min(abs(found.points[0, 0] - s) for s in MANY) < 2e-7

@@ -199,6 +199,18 @@ def test_clock_skew_is_reported(offset: float) -> None:
     assert results[0].reason is Reason.TIME_SKEW  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("offset", [2.0, -2.0])
+def test_clock_skew_is_said_again_and_again_but_not_each_time(offset: float) -> None:
+    messages = stream([*STOPS, *STOPS], offset=offset)
+    live = sorted(messages, key=lambda m: m[0] - (offset * NANO if m[1] else 0))
+    results = [r for r in feed(StandstillDetector(2), live, flush=False) if isinstance(r, Rejection)]
+    skew = [r for r in results if r.reason is Reason.TIME_SKEW and r.start == r.stop]
+    assert 4 <= len(skew) <= 6  # 12 s, and every 2 s after half a second or a whole one
+    assert all("behind the others" in r.message for r in skew)
+    # A standstill without points does not send anybody to look for the tracker.
+    assert all(r.reason is Reason.TIME_SKEW for r in results[1:])
+
+
 def test_nan_points_are_reported_and_do_no_harm() -> None:
     blind = [(t, k, np.full(3, np.nan) if k else v) for t, k, v in stream([0.0])]
     results = feed(StandstillDetector(2), blind)
