@@ -32,7 +32,7 @@ def pick_joints(names: Sequence[str], positions: ArrayLike, joint_names: Sequenc
     where = {name: i for i, name in enumerate(names)}
     for name in joint_names:
         if name not in where:
-            raise UnknownNameError("name", name, names[:MOST_NAMES])
+            raise UnknownNameError("name", name, list(dict.fromkeys(filter(None, names)))[:MOST_NAMES])
     if len(where) != len(names):
         doubled = sorted({n for n in joint_names if names.count(n) > 1})
         if doubled:

@@ -203,8 +203,8 @@ class CampaignNode(ManagedNode[CampaignParameters]):
     def _on_description(self, message: String) -> None:
         try:
             model = self._source.take(message.data)
-        except CalibPlannerError as error:
-            self.get_logger().error(f"{TOPIC} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
+        except CalibPlannerError:
+            self.get_logger().error(self._source.refusal, throttle_duration_sec=1.0)
             return
         if model is not None:
             self.get_logger().info(f"{TOPIC}: {model.robot.name}; it counts from the next campaign on")

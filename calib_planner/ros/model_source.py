@@ -2,8 +2,9 @@
 
 Anyone on the graph may publish a robot description, so it is bounded before it is parsed (length, number of
 links and joints), and ``robot.urdf`` refuses document types, which are the way to entities. What is refused
-changes nothing, if a description was accepted before; if none was, there is no robot: to go on with another one
-by name would plan for a machine that is not there.
+changes nothing: the robot before it stays, heard or by name, or whoever sends rubbish could take the planner out
+of service. Since the refused one may be the machine that is there, ``refusal`` is said beside every plan until a
+description is accepted again; and no machine executes a plan of another robot's name.
 """
 
 from __future__ import annotations
@@ -99,11 +100,15 @@ def _check_size(text: str) -> None:
 
 
 class ModelSource:
-    """The model in force; the only thing here that changes, by assignment of one value at a time."""
+    """The model in force; the only thing here that changes, by assignment of one value at a time.
+
+    Attributes:
+        refusal: Why the newest description was refused and what stays; empty if it was not.
+    """
 
     def __init__(self, settings: PlannerParameters) -> None:
         self._settings = settings
-        self._text = ""
+        self._text = self.refusal = ""
         self._found: Model | NotReady = NotReady(
             f"no robot yet: publish a URDF on {TOPIC} (latched), or set the parameter robot; "
             "a request may also name a shipped robot"
@@ -120,15 +125,19 @@ class ModelSource:
         """Take a description; ``None`` if it is the one in force.
 
         Raises:
-            CalibPlannerError: It is refused.
+            CalibPlannerError: It is refused; ``refusal`` says what that means.
         """
         if text and text == self._text:
+            self.refusal = ""
             return None
         try:
             found = described_model(text, self._settings.base_link, self._settings.tip_link)
         except CalibPlannerError as error:
-            if not self._text:
-                self._found = NotReady(f"the robot description was refused: {str(error)[:800]}")
+            self.refusal = f"{TOPIC} refused: {str(error)[:800]}"
+            if isinstance(self._found, Model):
+                self.refusal += f"; {self._found.robot.name} stays the robot"
+            else:
+                self._found = NotReady(self.refusal)
             raise
-        self._found, self._text = found, text
+        self._found, self._text, self.refusal = found, text, ""
         return found

@@ -14,6 +14,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
@@ -103,8 +104,8 @@ class PlannerNode(ManagedNode[PlannerParameters]):
     def _on_description(self, message: String) -> None:
         try:
             model = self._source.take(message.data)
-        except CalibPlannerError as error:
-            self.get_logger().error(f"{TOPIC} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
+        except CalibPlannerError:
+            self.get_logger().error(self._source.refusal, throttle_duration_sec=1.0)
             return
         if model is not None:
             joints = ", ".join(model.robot.joint_names)
@@ -162,6 +163,8 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         began = time.perf_counter()
         try:
             result = answer(request, self.settings.value, self._source.model, callback)
+            if result.plan is not None and self._source.refusal and not request.robot:
+                result = replace(result, message=f"{result.message}; {self._source.refusal}")
         except Exception as error:
             result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {str(error)[:1000]}")
         if self.context.ok():

@@ -114,6 +114,11 @@ def test_joint_states_that_do_not_fit(state: JointState) -> None:
 def test_a_missing_joint_is_named() -> None:
     with pytest.raises(UnknownNameError, match="'b'"):
         c.joints_from_message(joint_state(a=1.0), ["a", "b"])
+    nameless = JointState(name=["", "", "a", "a"], position=[0.0] * 4)
+    with pytest.raises(UnknownNameError, match="one of: a, got 'b'"):
+        c.joints_from_message(nameless, ["b"])
+    with pytest.raises(UnknownNameError, match="there are none"):
+        c.joints_from_message(JointState(name=["", ""], position=[0.0] * 2), ["b"])
 
 
 def test_points_and_joints_there_and_back() -> None:
