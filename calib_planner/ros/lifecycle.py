@@ -36,7 +36,7 @@ from rclpy.timer import Timer
 from calib_planner.errors import CalibPlannerError, UnknownNameError
 from calib_planner.ros.lasting import LastingActionServer, lasting
 from calib_planner.ros.parameters import QOS, NodeParameters, parameter
-from calib_planner.ros.qos import overridable, own
+from calib_planner.ros.qos import REQUESTS, overridable, own
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -238,6 +238,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **others: Any
     ) -> Service:
         """As rclpy's; an exception in the callback is logged and answered."""
+        others.setdefault("qos_profile", REQUESTS)
         made = super().create_service(srv_type, srv_name, self._safe_service(callback), **others)
         if self._made:
             lasting(made)
@@ -264,7 +265,8 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self, kind: Any, name: str, execute: Callable[..., Any], **others: Any
     ) -> ActionServer:
         """An action server; ``execute`` answers its faults itself, since only it knows its result's words."""
-        made = LastingActionServer(self, kind, name, execute, **others)
+        deep = {f"{part}_service_qos_profile": REQUESTS for part in ("goal", "cancel", "result")}
+        made = LastingActionServer(self, kind, name, execute, **(deep | others))
         if self._made:
             self._destroy_with(made.destroy)
         return made

@@ -30,6 +30,9 @@ SENSOR_IN = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 STREAM_IN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """The same where none may be missed: five seconds at 1 kHz."""
 
+REQUESTS = QoSProfile(depth=100)
+"""Requests: rclpy's 10 lose some of a burst, and whoever asked waits for ever."""
+
 DEEPEST = 100_000
 """Largest depth of a queue that an override may ask for."""
 

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
 from bench import Bench
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import GetParameters
+from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from test_planning import urdf
@@ -25,7 +27,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_planner.errors import InputError
 from calib_planner.ros.model_source import Model
 from calib_planner.ros.planner_node import PlannerNode
-from calib_planner.ros.qos import LATCHED
+from calib_planner.ros.qos import EVENTS, LATCHED
 
 SERVICE, ACTION = "calibration_planner/request_plan", "calibration_planner/plan"
 POSE = [0.3, 0.5]
@@ -116,6 +118,28 @@ def test_while_it_plans_it_answers_and_can_be_cancelled(bench: Bench) -> None:
     assert bench.call(PlanCalibration, SERVICE, request(time_limit=0.5)).status == Response.SUCCESS
 
 
+def test_every_one_of_a_burst_is_answered(bench: Bench) -> None:
+    """Forty at once, goals and calls, and all goals cancelled in one go."""
+    bench.start(PlannerNode, robot="planar_2r", starts=20_000)
+    kinds = ("goal", "result", "cancel")
+    client = ActionClient(bench.client, PlanAction, ACTION, **{f"{k}_service_qos_profile": EVENTS for k in kinds})
+    bench.actions.append(client)
+    caller = bench.client.create_client(PlanCalibration, SERVICE, qos_profile=EVENTS)
+    canceller = bench.client.create_client(CancelGoal, f"{ACTION}/_action/cancel_goal")
+    bench.wait(lambda: all(c.service_is_ready() for c in (caller, canceller)) and client.server_is_ready())
+    feedback: list[Any] = []
+    sent = [client.send_goal_async(long_goal(), feedback.append) for _ in range(40)]
+    handles = [bench.future(one) for one in sent]
+    assert all(handle.accepted for handle in handles)
+    results = [handle.get_result_async() for handle in handles]
+    bench.wait(lambda: feedback and sum(r.done() for r in results) == 39)
+    calls = [caller.call_async(request()) for _ in range(40)]
+    assert {bench.future(one).status for one in calls} == {Response.BUSY}
+    assert len(bench.future(canceller.call_async(CancelGoal.Request())).goals_canceling) == 1
+    ends = sorted(bench.future(one).result.status for one in results)
+    assert ends == [PlanAction.Result.BUSY] * 39 + [PlanAction.Result.CANCELLED]
+
+
 def change(bench: Bench, which: int) -> bool:
     return bench.change_state("calibration_planner", which)
 
@@ -190,6 +214,20 @@ def test_a_bad_description_changes_nothing_after_a_good_one(bench: Bench) -> Non
     source.take = taking
     publish(bench, urdf(10_000), lambda: refused)
     assert bench.call(PlanCalibration, SERVICE, request(test_poses=[0.1] * 3)).plan.robot == "wire"
+
+
+def test_a_robot_by_name_stays_when_a_description_is_refused(bench: Bench) -> None:
+    """Whoever sends rubbish does not take the planner out of service; every plan says what was refused."""
+    node = bench.start(PlannerNode, robot="planar_2r", starts=4)
+    publish(bench, "<robot", lambda: node._source.refusal)
+    answer = bench.call(PlanCalibration, SERVICE, request())
+    assert answer.status == Response.SUCCESS and answer.plan.robot == "planar_2r"
+    assert "well-formed" in answer.message and "planar_2r stays the robot" in answer.message
+    named = bench.call(PlanCalibration, SERVICE, request(robot="planar_2r"))
+    assert named.status == Response.SUCCESS and "refused" not in named.message
+    publish(bench, urdf(3), lambda: not node._source.refusal)
+    answer = bench.call(PlanCalibration, SERVICE, request(test_poses=[0.1] * 3))
+    assert answer.plan.robot == "wire" and "refused" not in answer.message
 
 
 def test_a_description_can_be_ignored(bench: Bench) -> None:
