@@ -16,21 +16,21 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-KINDS = {"robot": str, "seed": int, "autostart": lambda text: text == "true"}
+TRUTH = {"true": True, "false": False}
+KINDS = {"robot": str, "seed": int, "autostart": TRUTH.get, "use_sim_time": TRUTH.get}
 
 
 def node(context: LaunchContext, default: PathJoinSubstitution) -> list[Node]:
     """The node, with the arguments that were given."""
-    texts = {name: LaunchConfiguration(name).perform(context) for name in (*KINDS, "use_sim_time")}
+    texts = {name: LaunchConfiguration(name).perform(context) for name in KINDS}
     given = {name: kind(texts[name]) for name, kind in KINDS.items() if texts[name]}
-    given["use_sim_time"] = texts["use_sim_time"] == "true"
     return [
         Node(
             package="calib_planner",
             executable="simulator_node",
             name="tracker_simulator",
             namespace=LaunchConfiguration("namespace"),
-            parameters=[default, LaunchConfiguration("parameters"), given],
+            parameters=[default, LaunchConfiguration("parameters"), *filter(None, [given])],
             output="screen",
         )
     ]
@@ -39,7 +39,6 @@ def node(context: LaunchContext, default: PathJoinSubstitution) -> list[Node]:
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` runs."""
     default = PathJoinSubstitution([FindPackageShare("calib_planner"), "config", "simulator.yaml"])
-    truth = ["true", "false"]
     return LaunchDescription(
         [
             DeclareLaunchArgument("robot", default_value="", description="shipped robot name"),
@@ -47,13 +46,10 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
             DeclareLaunchArgument("parameters", default_value=default, description="YAML of node parameters"),
             DeclareLaunchArgument(
-                "autostart",
-                default_value="",
-                choices=["", *truth],
-                description="go to active without a lifecycle manager",
+                "autostart", default_value="", choices=["", *TRUTH], description="go to active without a manager"
             ),
             DeclareLaunchArgument(
-                "use_sim_time", default_value="false", choices=truth, description="stamps from /clock"
+                "use_sim_time", default_value="", choices=["", *TRUTH], description="stamps from /clock"
             ),
             OpaqueFunction(function=node, args=[default]),
         ]

@@ -22,7 +22,7 @@ ROS = {
         "rcl_interfaces",
         "sensor_msgs",
     ),
-    *("std_msgs", "std_srvs", "trajectory_msgs", "unique_identifier_msgs", "visualization_msgs"),
+    *("std_msgs", "std_srvs", "trajectory_msgs", "unique_identifier_msgs", "visualization_msgs", "rviz2"),
 }
 """Packages of ROS 2 Jazzy: they are keys by their own names."""
 KEYS = {
@@ -56,6 +56,14 @@ def imported(folder: Path) -> set[str]:
     return found - set(sys.stdlib_module_names) - {"calib_planner"}
 
 
+def launched() -> set[str]:
+    """Other packages whose nodes a launch file may start."""
+    files = (ROOT / "launch").glob("*.py")
+    keywords = [k for path in files for k in ast.walk(ast.parse(path.read_text())) if isinstance(k, ast.keyword)]
+    found = {k.value.value for k in keywords if k.arg == "package" and isinstance(k.value, ast.Constant)}
+    return {str(name) for name in found} - {"calib_planner"}
+
+
 def setup_call() -> dict[str, Any]:
     """The keywords of ``setup(…)`` that are literals."""
     tree = ast.parse((ROOT / "setup.py").read_text())
@@ -69,8 +77,8 @@ def setup_call() -> dict[str, Any]:
     return literal
 
 
-def test_package_xml_names_all_that_is_imported_and_nothing_else() -> None:
-    needed = imported(PACKAGE) | imported(ROOT / "launch")
+def test_package_xml_names_all_that_is_imported_or_launched_and_nothing_else() -> None:
+    needed = imported(PACKAGE) | imported(ROOT / "launch") | launched()
     assert needed <= ROS | set(KEYS) | EXTRAS, "unknown: find its rosdep key, or make it an extra"
     assert set(keys("exec_depend")) == {KEYS.get(name, name) for name in needed - EXTRAS}
 

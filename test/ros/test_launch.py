@@ -15,6 +15,10 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.node import Node
 
 from calib_planner.robot.catalogue import config_folder
 from calib_planner.ros.identifier_node import IdentifierNode
@@ -82,10 +86,10 @@ class Started(Recorded):
 
 
 class Value(Recorded):
-    """A LaunchConfiguration; given are the defaults."""
+    """A LaunchConfiguration."""
 
     def perform(self, context: Any) -> str:
-        return str(context.defaults[self.args[0]])
+        return str(context.values[self.args[0]])
 
 
 def load(path: Path) -> Any:
@@ -110,11 +114,12 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "launch_ros", ModuleType("launch_ros"))
 
 
-def described(path: Path) -> tuple[dict[str, Argument], list[Started]]:
-    """Arguments by name and nodes, those of opaque functions with the arguments' defaults."""
+def described(path: Path, **given: str) -> tuple[dict[str, Argument], list[Started]]:
+    """Arguments by name and nodes, those of opaque functions with what is given, else the arguments' defaults."""
     entities = load(path).generate_launch_description().args[0]
     arguments = {e.name: e for e in entities if isinstance(e, Argument)}
-    context = SimpleNamespace(defaults={n: a.named["default_value"] for n, a in arguments.items()})
+    defaults = {n: a.named["default_value"] for n, a in arguments.items()}
+    context = SimpleNamespace(values=defaults | given)
     nodes = [e for e in entities if isinstance(e, Started)]
     for entity in entities:
         if "function" in getattr(entity, "named", {}):
@@ -142,7 +147,7 @@ def test_arguments_are_explained_and_used(path: Path, stand_ins: None) -> None:
         assert choices is None or argument.named["default_value"] in choices, name
     mentioned = used(nodes)
     assert mentioned <= set(arguments)
-    opaque = set(getattr(load(path), "KINDS", ())) | {"use_sim_time"}
+    opaque = set(getattr(load(path), "KINDS", ()))
     assert set(arguments) - mentioned <= opaque
 
 
@@ -165,3 +170,39 @@ def test_rviz_is_asked_for(path: Path, stand_ins: None) -> None:
     for node in (n for n in nodes if n.named["package"] != "calib_planner"):
         assert node.named["package"] == "rviz2" and used(node.named["condition"]) == {"rviz"}
         assert arguments["rviz"].named["default_value"] == "false"
+
+
+GIVEN = {"robot": "ur10e", "seed": "7", "store_folder": "/given", "autostart": "true", "use_sim_time": "false"}
+WRITTEN = {"robot": "planar_2r", "seed": 3, "store_folder": "/file", "autostart": False, "use_sim_time": True}
+
+
+def in_force(folder: Path, node: Started, written: dict[str, Any]) -> dict[str, Any]:
+    """Parameters that a node has when it is started so: files as launch_ros passes them, merged by ROS itself."""
+    words, name = ["--ros-args"], node.named["name"]
+    for k, entry in enumerate(node.named["parameters"]):
+        path = folder / f"{k}.yaml"
+        if isinstance(entry, dict):
+            path.write_text(yaml.safe_dump({f"/{name}": {"ros__parameters": entry}}))
+        elif isinstance(entry, Value):
+            path.write_text(yaml.safe_dump({"/**": {"ros__parameters": written}}))
+        else:
+            path = config_folder() / entry.args[0][-1]
+        words += ["--params-file", str(path)]
+    context = Context()
+    rclpy.init(args=words, context=context)
+    made = Node(name, context=context, automatically_declare_parameters_from_overrides=True)
+    try:
+        return {k: p.value for k, p in made.get_parameters_by_prefix("").items() if k in written}
+    finally:
+        made.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if "demo" not in p.name], ids=lambda p: p.name)
+def test_arguments_win_if_given_else_the_file_of_the_user(path: Path, stand_ins: None, tmp_path: Path) -> None:
+    kinds = load(path).KINDS
+    written = {name: WRITTEN[name] for name in kinds}
+    for given in ({}, *({name: GIVEN[name]} for name in kinds), {name: GIVEN[name] for name in kinds}):
+        (node,) = (n for n in described(path, **given)[1] if n.named["package"] == "calib_planner")
+        expected = written | {name: yaml.safe_load(text) for name, text in given.items()}
+        assert in_force(tmp_path, node, written) == expected
