@@ -80,7 +80,7 @@ def analyse(
     triangle = np.zeros((len(basis), len(basis)))  # of the columns kept: their coordinates in the basis
     kept: list[int] = []
     held: list[int] = []
-    directions: list[FloatArray] = []
+    shares: list[FloatArray] = []
     lengths: list[float] = []
     least = np.zeros(len(names)) if shortest is None else shortest
     for i in order:
@@ -99,25 +99,31 @@ def analyse(
             lengths.append(size * float(scale[i]))
         else:
             held.append(i)
-            directions.append(_direction(triangle[: len(kept), : len(kept)], share, scale, kept, i))
+            shares.append(share)
+    directions = _directions(triangle[: len(kept), : len(kept)], shares, scale, kept, held)
     said = (np.where(np.abs(d) * scale > SMALL * scale[i], d, 0.0) for d, i in zip(directions, held, strict=True))
     combinations = tuple(describe(d, names, first=i) for d, i in zip(said, held, strict=True))
-    matrix = np.array(directions).reshape(len(held), len(names))
-    return Identifiability(tuple(kept), combinations, tuple(held), matrix, tuple(lengths))
+    return Identifiability(tuple(kept), combinations, tuple(held), directions, tuple(lengths))
 
 
-def _direction(triangle: FloatArray, share: FloatArray, scale: FloatArray, kept: list[int], i: int) -> FloatArray:
-    """(P,) change of the parameters that no point shows: i by one, and what undoes it.
+def _directions(
+    triangle: FloatArray, shares: list[FloatArray], scale: FloatArray, kept: list[int], held: list[int]
+) -> FloatArray:
+    """(held, P) changes of the parameters that no point shows: the one held by one, and what undoes it.
 
-    ``triangle`` (kept, kept) and ``share`` (kept,) are the columns kept and column i in the orthonormal basis.
+    ``triangle`` (kept, kept) and ``shares``, each (those kept before it,), are the columns kept and held in the
+    orthonormal basis.
     """
-    direction = np.zeros(len(scale))
-    direction[i] = 1.0
-    if scale[i] > 0.0 and kept:
-        weights = solve_triangular(triangle, share, check_finite=False)
+    directions = np.zeros((len(held), len(scale)))
+    directions[np.arange(len(held)), held] = 1.0
+    if kept and held:
+        columns = np.zeros((len(kept), len(held)))
+        for column, share in zip(columns.T, shares, strict=True):
+            column[: len(share)] = share
+        weights = solve_triangular(triangle, columns, check_finite=False)
         weights[np.abs(weights) <= ROUNDING] = 0.0
-        direction[kept] = -weights * scale[i] / scale[kept]
-    return direction
+        directions[:, kept] = -weights.T * scale[held][:, None] / scale[kept]
+    return directions
 
 
 def describe(direction: FloatArray, names: Sequence[str], first: int) -> str:

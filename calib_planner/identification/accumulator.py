@@ -1,11 +1,12 @@
 """Identification one configuration at a time: the estimate after every measurement, and undo of any of them.
 
 What is kept is the measurements, each under a number of its own, and the newest estimate. The next estimate is an
-``identify`` of what is there then, begun from that one: near the minimum every step of the Gauss–Newton
-iteration, eq. (6), divides the distance to it by orders of magnitude, so that a good start saves steps, and
-nothing is taken over from it but the place to begin. All that is decided on the way (which parameters can be told
-apart, which points to believe, where the scatter comes from) is decided anew by the data. So the answer does not
-depend on the order in which measurements came and went: it is that of the same measurements given at once.
+``identify`` of what is there then. Near the minimum every step of the Gauss–Newton iteration, eq. (6), divides
+the distance to it by orders of magnitude; where a first fit from nominal values has not come as near, the newest
+estimate is the place to go on from, and nothing else is taken over from it. All that is decided on the way (which
+parameters can be told apart, which points to believe, where the scatter comes from) is decided anew by the data.
+So the answer does not depend on the order in which measurements came and went: it is that of the same
+measurements given at once.
 
 That holds where there is one minimum to go to. With few data there may be several, and the way tells which is
 found: so the way is the batch's, from nominal values, until there are twice as many equations as parameters, and

@@ -17,6 +17,7 @@ block-diagonal, a block per configuration. Blocks of equal size are kept in one 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from scipy.spatial import cKDTree
 
 from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.motion import Motion
 from calib_planner.identification.prior import Prior
 from calib_planner.robot.chain import Robot
 
@@ -69,6 +71,7 @@ class Equations:
         use: (N, targets) which points take part.
         whitening: L⁻¹ of their covariance; equations are ordered row, target, axis.
         prior: What is known beforehand, or ``None``.
+        known: Positions and Jacobians of the robot at the data's configurations, if some are known already.
     """
 
     robot: Robot
@@ -76,6 +79,12 @@ class Equations:
     use: NDArray[np.bool_]
     whitening: Whitening
     prior: Prior | None = None
+    known: Motion | None = None
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Where the points are and how they move."""
+        return self.known or Motion(self.robot, self.data.q)
 
     def residuals(self, deviations: FloatArray) -> FloatArray:
         """(equations + prior rows,) whitened measured − predicted."""
@@ -85,9 +94,9 @@ class Equations:
 
     def linearise(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals as above and whitened Jacobian (equations + prior rows, P)."""
-        predicted, jacobian = self.robot.positions_and_jacobian(self.data.q, deviations)
-        blocks = jacobian.reshape(*self.data.p.shape, -1)
-        rows = self.whitening.apply(blocks[self.use].reshape(-1, blocks.shape[-1]))
+        predicted, blocks = self.motion.at(deviations)
+        used = blocks if self.use.all() else blocks[self.use]
+        rows = self.whitening.apply(used.reshape(-1, blocks.shape[-1]))
         residuals = self.whitening.apply((self.data.p - predicted)[self.use].ravel())
         if self.prior is None:
             return residuals, rows

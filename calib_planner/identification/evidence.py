@@ -30,6 +30,8 @@ from calib_planner.robot.chain import Robot
 
 BLIND = 1e-5
 """A test pose that moves less than this per unit of an unseen combination does not depend on it [m/m | m/rad]."""
+PLACED = 1e-9
+"""Share of the sum of squares that a better placement of the nominal robot must take off."""
 WEAK = 1e-2
 """Unit columns whose combination is shorter than this are nearly dependent."""
 
@@ -69,7 +71,7 @@ def estimate_of(evidence: Evidence) -> Estimate:
     kept = list(fit.kept)
     std = np.full(len(names), np.nan)
     std[kept] = np.sqrt(np.diag(evidence.covariance)[kept])
-    predicted = robot.positions(data.q, fit.deviations)
+    predicted = evidence.equations.motion.at(fit.deviations)[0]
     residuals = data.p - predicted
     before = fit_placement(robot, data, evidence.equations).positions(data.q)
     use = evidence.equations.use
@@ -147,7 +149,7 @@ def fit_placement(robot: Robot, data: Measurements, equations: Equations | None 
     fitted = robot.with_parameters(placement)
     unit = np.broadcast_to(UNKNOWN_SIGMA**2 * np.eye(3), (*data.p.shape, 3))
     alike = Equations(fitted, data, use, point_whitening(unit, use))
-    fit = gauss_newton(alike, np.zeros(len(placement)), tuple(range(len(placement))), 50)
+    fit = gauss_newton(alike, np.zeros(len(placement)), tuple(range(len(placement))), 50, gain=PLACED)
     return robot.with_deviations(dict(zip(placement, fit.deviations, strict=True)))
 
 

@@ -36,7 +36,7 @@ class Fit:
         scale: (kept,) column lengths that were divided out.
         residuals: (equations + prior rows,) whitened.
         iterations: Linear problems solved.
-        converged: Whether the last step was negligible.
+        converged: Whether the last step was negligible, or the next one not worth making.
     """
 
     deviations: FloatArray
@@ -62,7 +62,12 @@ class Fit:
 
 
 def gauss_newton(
-    equations: Equations, start: FloatArray, kept: tuple[int, ...], most: int, enough: float = 0.0
+    equations: Equations,
+    start: FloatArray,
+    kept: tuple[int, ...],
+    most: int,
+    enough: float = 0.0,
+    gain: float = 0.0,
 ) -> Fit:
     """Minimise the sum of squares over the parameters ``kept``.
 
@@ -72,6 +77,7 @@ def gauss_newton(
         kept: Indices of an irreducible set of parameters.
         most: Most iterations.
         enough: Sum of squares below which it need not go on.
+        gain: Share of the sum of squares that a step must promise to take off to be worth making.
     """
     columns = list(kept)
     deviations = start
@@ -79,6 +85,9 @@ def gauss_newton(
     triangle, scale, right = _triangle(jacobian[:, columns], residuals)
     damping, done, converged = 0.0, 0, not columns
     while done < most and not converged:
+        if not damping and right @ right < gain * (residuals @ residuals):
+            converged = True
+            break
         done += 1
         step = _step(triangle, right, damping)
         trial = deviations.copy()
@@ -87,6 +96,7 @@ def gauss_newton(
         converged = bool(size <= STEP_FLOOR + STEP_TOLERANCE * np.linalg.norm(residuals))
         if converged and not damping:
             # Nothing changes by so small a step but the parameters that hardly anything depends on.
+            equations.motion.carry(deviations, trial)
             deviations, residuals = trial, residuals - jacobian[:, columns] @ (step / scale)
             break
         cost, new_cost = float(residuals @ residuals), np.inf

@@ -15,7 +15,7 @@ t on the right-hand side.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,34 +25,68 @@ from calib_planner.identification.measurements import Measurements
 from calib_planner.robot.chain import Robot
 
 
-def register(
-    robot: Robot,
-    data: Measurements,
-    *,
-    base: bool,
-    tool: bool,
-    weights: FloatArray | None = None,
-    poses: tuple[FloatArray, FloatArray] | None = None,
-) -> Robot:
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the tracker's frame is, and the targets in the tip's.
+
+    Attributes:
+        rotation, origin: R_b (3, 3) and t_b (3,) [m]; none (1 and 0) where the tip's poses hold them already.
+        offsets: t of each target (targets, 3) [m].
+    """
+
+    rotation: FloatArray
+    origin: FloatArray
+    offsets: FloatArray
+
+    def positions(self, poses: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """(N, targets, 3) [m] of the tip's rotations (N, 3, 3) and origins (N, 3)."""
+        rotations, origins = poses
+        points = self.offsets @ np.swapaxes(rotations, 1, 2) + origins[:, None]
+        return np.asarray(points @ self.rotation.T + self.origin)
+
+    def of(self, robot: Robot, *, base: bool, tool: bool) -> Robot:
+        """``robot`` there, as far as it was unknown."""
+        robot = robot.with_base(self.rotation, self.origin) if base else robot
+        return robot.with_targets(self.offsets) if tool else robot
+
+
+def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Robot:
     """``robot`` with the base pose and target offsets that fit the nominal kinematics best.
 
     Args:
         base: The tracker's pose is unknown; otherwise the robot's base pose is kept.
         tool: The target offsets are unknown; otherwise the robot's targets are kept.
-        weights: (N, targets) >= 0, how much each point counts; default all alike.
-        poses: ``tip_poses`` of these data, where they are known already.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknowns, or all configurations alike.
     """
     if not (base or tool):
         return robot
-    rotations, origins = poses or tip_poses(robot, data.q, at_base=base)
+    poses = tip_poses(robot, data.q, at_base=base)
+    return place(robot, data, poses, base=base, tool=tool).of(robot, base=base, tool=tool)
+
+
+def place(
+    robot: Robot,
+    data: Measurements,
+    poses: tuple[FloatArray, FloatArray],
+    *,
+    base: bool,
+    tool: bool,
+    weights: FloatArray | None = None,
+) -> Placement:
+    """The same for the ``tip_poses`` of these data, without making a robot.
+
+    Args:
+        weights: (N, targets) >= 0, how much each point counts; default all alike.
+    """
+    rotations, origins = poses
     row, target = np.nonzero(data.seen)
     p, r, o = data.p[row, target], rotations[row], origins[row]
     root = np.ones(len(row)) if weights is None else np.sqrt(weights[row, target])
     offsets = robot.target_offsets
-    matrix, xyz = (np.eye(3), np.zeros(3)) if base else robot.base_pose
+    matrix: FloatArray = np.eye(3)
+    xyz: FloatArray = np.zeros(3)
     if base:
         matrix = _base_rotation(p, r, o, target, None if tool else offsets, root)
     targets = len(robot.targets)
@@ -70,8 +104,7 @@ def register(
     solution = _solve(system.reshape(3 * len(row), -1), (right * root[:, None]).ravel())
     if base:
         xyz, solution = solution[:3], solution[3:]
-        robot = robot.with_base(matrix, xyz)
-    return robot.with_targets(solution.reshape(targets, 3)) if tool else robot
+    return Placement(matrix, xyz, solution.reshape(targets, 3) if tool else offsets)
 
 
 def _base_rotation(

@@ -10,6 +10,8 @@ it did not. Points go and come back until the selection stands still. The gate i
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -18,7 +20,7 @@ from scipy.stats import f as fisher_f
 from calib_planner._arrays import FloatArray
 from calib_planner.identification.equations import Equations
 from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.registration import register, tip_poses
+from calib_planner.identification.registration import place, tip_poses
 from calib_planner.robot.chain import Robot
 
 ALARM = 0.01
@@ -27,11 +29,14 @@ CAUCHY = 2.385
 """c: 95 % efficient for normal errors."""
 FAR = 0.05
 """What hardly any point sees is kept this close to the start while points are selected [m | rad]."""
+BENT = 0.01
+"""Points this far from where a step's Jacobian sent them, in standard deviations, need another Jacobian."""
 LEAST_SCALE = 1e-8
 """Least variance that residuals without any freedom are taken to have, in units of the instrument's."""
 MEDIAN = float(chi2.median(3))
 
 
+@functools.lru_cache(maxsize=256)
 def gate_of(points: int, freedom: float = np.inf) -> float:
     """Largest believable normalised residual of ``points`` points.
 
@@ -59,19 +64,19 @@ def robust_registration(robot: Robot, data: Measurements, *, base: bool, tool: b
     if not (base or tool):
         return robot
     weights, poses = np.ones(data.seen.shape), tip_poses(robot, data.q, at_base=base)
-    found = register(robot, data, base=base, tool=tool, poses=poses)
+    found = place(robot, data, poses, base=base, tool=tool)
     for _ in range(30):
-        lengths = np.linalg.norm(data.p - found.positions(data.q), axis=2)
+        lengths = np.linalg.norm(data.p - found.positions(poses), axis=2)
         scale = float(np.nanmedian(lengths))
         if scale == 0.0:
             break
         new = np.where(data.seen, 1.0 / (1.0 + (lengths / scale) ** 2), 0.0)
         settled = np.nanmax(np.abs(new - weights)) < 1e-3
         weights = new
-        found = register(robot, data, base=base, tool=tool, weights=weights, poses=poses)
+        found = place(robot, data, poses, base=base, tool=tool, weights=weights)
         if settled:
             break
-    return found
+    return found.of(robot, base=base, tool=tool)
 
 
 def select(
@@ -90,8 +95,9 @@ def select(
     count = int(equations.use.sum())
     freedom = max(3 * count + prior - len(columns), 1) / (3 * count + prior)
     weights, scale = np.ones(count), 1.0
+    residuals, jacobian = equations.linearise(deviations)
+    straight = 0.0  # length of a step that did not bend: nor does a shorter one
     for _ in range(50):
-        residuals, jacobian = equations.linearise(deviations)
         squares = np.sum(residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
         scale = float(np.median(squares)) / MEDIAN / freedom
         scale = max(scale, 1.0 if scale_known else LEAST_SCALE)
@@ -109,6 +115,15 @@ def select(
         weights = new
         if settled:
             break
+        change = jacobian[:, columns] @ step
+        length = float(np.abs(change).max(initial=0.0))
+        residuals = residuals - change
+        if not length <= straight:
+            there = equations.residuals(deviations)
+            if np.abs(there - residuals).max() < BENT * np.sqrt(scale):
+                residuals, straight = there, length
+            else:
+                residuals, jacobian = equations.linearise(deviations)
     squares = np.sum(equations.residuals(deviations)[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     use = equations.use.copy()
     use[equations.use] = squares <= scale * gate_of(count) ** 2

@@ -59,8 +59,8 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
 
     Args:
         problem: What is asked.
-        start: Values to begin from, such as the estimate before the newest measurement; saves time, the answer
-            is the same.
+        start: Values to go on from where a first fit from nominal ones has not come near the minimum, such as the
+            estimate before the newest measurement; saves time, the answer is the same.
 
     Raises:
         NotEnoughDataError: Fewer equations than parameters, or fewer good points than are needed.
@@ -68,15 +68,13 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
     """
     began = time.perf_counter()
     check_units(problem.robot, problem.data)
-    seen = problem.data.seen
     robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
-    check_count(problem, seen)
-    use = _believed(problem, robot)
+    check_count(problem, problem.data.seen)
     # What is decided on the way is decided from nominal: no start can tip it.
-    work, first = without_unseen(Work.of(problem, robot, use))
-    if start is not None and problem.loss == "linear":
+    work, first, near = _begun(problem, robot)
+    if start is not None and problem.loss == "linear" and not near:
         first = work.start_values(start)
-    found = weigh(work, use, first)
+    found = weigh(work, work.use, first)
     if problem.loss == "robust":
         found = _gated(work, found)
     found, starts, agreeing = _other_starts(work, found)
@@ -121,16 +119,17 @@ def start_robot(robot: Robot, data: Measurements, *, robust: bool = False) -> Ro
 # ── points come and go ───────────────────────────────────────────────────────────────────────────────
 
 
-def _believed(problem: IdentificationProblem, robot: Robot) -> NDArray[np.bool_]:
-    """(N, targets) points to begin with: all of them, or those inside the gate of a fit that forgets far ones."""
+def _begun(problem: IdentificationProblem, robot: Robot) -> tuple[Work, FloatArray, bool]:
+    """``without_unseen`` of the points to begin with: all, or those that a fit forgetting far ones believes."""
     seen = problem.data.seen
+    whole = Work.of(problem, robot, seen)
+    work, first, near = without_unseen(whole)
     if problem.loss != "robust":
-        return seen
-    work, first = without_unseen(Work.of(problem, robot, seen))
+        return work, first, near
     known = work.source != "residuals"
     use = select(work.equations(seen, work.instrument), work.kept, first, scale_known=known)
     check_count(problem, use)
-    return use
+    return (work, first, near) if (use == seen).all() else without_unseen(whole.told_by(use))
 
 
 def _gated(work: Work, found: Weighed) -> Weighed:
@@ -162,8 +161,7 @@ def _gate(found: Weighed) -> float:
 
 def _normalised(work: Work, found: Weighed) -> FloatArray:
     """(N, targets) length of each residual in standard deviations of what it should be."""
-    data = work.problem.data
-    return normalised(data.p - work.robot.positions(data.q, found.fit.deviations), found.residual_covariance())
+    return normalised(found.residuals, found.residual_covariance())
 
 
 def check_count(problem: IdentificationProblem, use: NDArray[np.bool_]) -> None:
@@ -226,9 +224,8 @@ def _same(one: Fit, other: Fit) -> bool:
 
 
 def _structure(work: Work, found: Weighed) -> tuple[Structure, ...]:
-    data, use = work.problem.data, found.equations.use
-    residuals = data.p - work.robot.positions(data.q, found.fit.deviations)
-    return residual_structure(work.robot, data.q, residuals, use, work.labels)
+    use, q = found.equations.use, work.problem.data.q
+    return residual_structure(work.robot, q, found.residuals, use, work.labels)
 
 
 def _transmission(work: Work, found: Weighed, structure: tuple[Structure, ...]) -> Transmission | None:

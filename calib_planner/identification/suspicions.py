@@ -77,7 +77,8 @@ def explain(
                     found[int(i), int(t)] = f"fits target {targets[k] + 1}: targets exchanged?"
                 continue
         apart = np.linalg.norm(predicted[:, targets] - data.p[i, targets], axis=2)
-        apart = np.median(apart, axis=1)  # one of the points may be wrong besides
+        # One of the points may be wrong besides.
+        apart = np.median(apart, axis=1) if len(targets) > 1 else apart[:, 0]
         apart[i] = np.inf
         k = int(apart.argmin())
         if apart[k] < reach:

@@ -59,12 +59,22 @@ class Weighed:
     chi_square: float  # of measurement noise alone
     freedom: int
 
+    @property
+    def rows(self) -> FloatArray:
+        """(N, targets, 3, P) ∂p/∂Π where the fit ended."""
+        return self.equations.motion.at(self.fit.deviations)[1]
+
+    @property
+    def residuals(self) -> FloatArray:
+        """(N, targets, 3) measured − predicted [m]."""
+        return self.equations.data.p - self.equations.motion.at(self.fit.deviations)[0]
+
     def residual_covariance(self) -> FloatArray:
         """(N, targets, 3, 3) of measured − predicted: Σ + JCJᵀ, and less its cross terms where a point took part.
 
         With W = Σ⁻¹ the cross terms are JCJᵀ, and Σ − JCJᵀ is left.
         """
-        rows = _rows(self.equations, self.fit)
+        rows = self.rows
         known = bool(np.isfinite(self.covariance).all())
         covariance = self.covariance if known else self.fit.covariance()
         cross = self.cross + np.swapaxes(self.cross, 2, 3)
@@ -102,7 +112,7 @@ def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
     cost = fit.cost
     levels = replace(levels, measurement=float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0)))
     covariance = fit.covariance()
-    cross = spread(_rows(equations, fit), covariance)
+    cross = spread(equations.motion.at(fit.deviations)[1], covariance)
     found = Weighed(equations, fit, levels, instrument, cross, covariance, cost, freedom)
     told_by = repeats if source == "repetitions" else 0
     if work.problem.discrepancy == "off" or not improbable(cost, freedom, told_by) or seen <= len(work.kept):
@@ -133,7 +143,8 @@ def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels,
     weights = scale * instrument
     total = (factor if np.isfinite(factor) else 1.0) * weights
     covariance = (factor if equations.prior is None else 1.0) * fit.covariance()
-    cross = spread(_rows(equations, fit), covariance if np.isfinite(factor) else fit.covariance())
+    known = covariance if np.isfinite(factor) else fit.covariance()
+    cross = spread(equations.motion.at(fit.deviations)[1], known)
     return Weighed(equations, fit, levels, total, cross, covariance, float("nan"), freedom)
 
 
@@ -141,10 +152,10 @@ def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Wei
     """The same points with the scatter that they have, discrepancy included."""
     equations, data, columns = found.equations, work.problem.data, list(found.fit.kept)
     model = DiscrepancyModel.of(equations, instrument, work.labels)
-    predicted, jacobian = work.robot.positions_and_jacobian(data.q, found.fit.deviations)
-    rows = jacobian.reshape(*data.p.shape, -1)[equations.use].reshape(-1, jacobian.shape[-1])[:, columns]
+    jacobian = found.rows
+    rows = jacobian[equations.use].reshape(-1, jacobian.shape[-1])[:, columns]
     prior = equations.prior_rows(found.fit.deviations)
-    residuals = (data.p - predicted)[equations.use].ravel()
+    residuals = found.residuals[equations.use].ravel()
     variances = estimate_variances(model, residuals, rows, (prior[0][:, columns], prior[1]))
     weights = instrument + model.mean_square(variances) * np.eye(3)
     equations = work.equations(equations.use, weights)
@@ -169,7 +180,7 @@ def _sandwich(
 ) -> tuple[FloatArray, FloatArray]:
     """For W⁻¹ = ``weights``: N⁻¹ (JᵀWΣWJ + prior) N⁻¹, and JN⁻¹JᵀWΣ of each point with itself."""
     use, inverse = equations.use, fit.covariance()
-    rows = _rows(equations, fit)
+    rows = equations.motion.at(fit.deviations)[1]
     pulled = np.linalg.solve(weights[use], rows[use])
     columns = np.hstack([np.sqrt(v) * c for v, c in zip(variances, model.columns, strict=True)])
     # ΣWJ, block by block: the instrument's part of each point, and what the points of a configuration share.
@@ -185,18 +196,11 @@ def _sandwich(
     return covariance, cross
 
 
-def _rows(equations: Equations, fit: Fit) -> FloatArray:
-    """(N, targets, 3, P) ∂p/∂Π where the fit ended."""
-    jacobian = np.ascontiguousarray(equations.robot.jacobian(equations.data.q, fit.deviations))
-    return jacobian.reshape(*equations.data.p.shape, -1)
-
-
 def _targets_err_alike(work: Work, found: Weighed) -> bool:
-    use, data = found.equations.use, work.problem.data
+    use = found.equations.use
     if use.shape[1] < 2:
         return False
-    residuals = data.p - work.robot.positions(data.q, found.fit.deviations)
-    structure = residual_structure(work.robot, data.q, residuals, use, work.labels)
+    structure = residual_structure(work.robot, work.problem.data.q, found.residuals, use, work.labels)
     return any(s.kind == "configuration" and s.probability < SIGNIFICANT for s in structure)
 
 

@@ -218,8 +218,10 @@ class Robot:
 
     def joint_jacobian(self, q: ArrayLike, deviations: ArrayLike | None = None) -> FloatArray:
         """∂position/∂joint, shape (N, 3·targets, joints) [m/rad | 1], base frame."""
-        columns = self.linearise(q, deviations).joint_columns
-        return columns.reshape(len(self.joint_names), 3 * len(self.targets), -1).transpose(2, 1, 0)
+        clean, amounts = self._check_q(q), self._amounts(self._check_deviations(deviations))
+        joints, t = self._layout.joint_elements, len(self.targets)
+        rows = self._program(amounts, joints, ()).run(np.ascontiguousarray(clean.T), amounts)
+        return rows[3 * t :].reshape(len(joints), 3 * t, -1).transpose(2, 1, 0)
 
     def posture(self, q: ArrayLike) -> Posture:
         """Where joints, tip and targets are: every frame of the chain in one pass; see ``Posture``."""
