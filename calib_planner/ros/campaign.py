@@ -195,15 +195,28 @@ class Campaign:
         last = next((d for d in reversed(self.kept) if number in (0, d.number)), None)
         if last is None:
             return None
-        undone = last.now(UNDONE, "withdrawn on request")
-        self.store.decide(self._ensure_begun(), [undone])
-        self.kept.remove(last)
-        self._unsaved.pop(last.number, None)
-        self._others[UNDONE] += 1
+        return self.withdraw(last, UNDONE, "withdrawn on request")
+
+    def withdraw(self, kept: Decision, status: str, reason: str) -> Decision:
+        """Use one of ``kept`` no more.
+
+        Raises:
+            StoreError: That cannot be written; nothing was changed.
+        """
+        gone = kept.now(status, reason)
+        self.store.decide(self._ensure_begun(), [gone])
+        self.kept.remove(kept)
+        self._unsaved.pop(kept.number, None)
+        self._others[status] += 1
         self.newest = None
-        return undone
+        return gone
 
     # ── what there is ────────────────────────────────────────────────────────────────────────────────
+
+    @property
+    def frame(self) -> str:
+        """Frame of the points that are kept; empty if none is, or none was named."""
+        return next((d.frame for d in self.kept if d.frame), "")
 
     @property
     def accepted(self) -> list[Decision]:

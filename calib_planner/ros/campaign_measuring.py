@@ -1,8 +1,9 @@
 """Measuring what a campaign wants measured: tell the identifier the plan, send the robot, hear what was accepted.
 
 One configuration at a time, and every step has an end. A robot that refuses a configuration cannot reach it; a
-standstill that the identifier rejects, or of which it says nothing, is a failed attempt. What is not there or
-does not answer is not the configuration's fault: it is waited for, and tried again every ``RETRY`` seconds.
+standstill that the identifier rejects, or of which it says nothing, is a failed attempt. What is not there, does
+not answer or would spoil any measurement (``ANYWHERE``) is not the configuration's fault: it is waited for, and
+tried again every ``RETRY`` seconds.
 """
 
 from __future__ import annotations
@@ -27,6 +28,14 @@ from calib_planner.ros.settings import CampaignParameters
 
 RETRY = 2.0
 """Time between two attempts at something that did not answer [s]."""
+ANYWHERE = (
+    Measurement.REJECTED_TIME_SKEW,
+    Measurement.REJECTED_CLOCK_OFFSET,
+    Measurement.REJECTED_OTHER_FRAME,
+    Measurement.REJECTED_BAD_JOINTS,
+    Measurement.REJECTED_NOT_STORED,
+)
+"""Rejections that another configuration would meet as well."""
 
 
 @dataclass
@@ -38,12 +47,16 @@ class Visit:
         since: When the phase began [s].
         phase: ``telling`` the plan, ``sending`` the robot, ``moving``, ``judging`` (the identifier does).
         said: The identifier's last reason for a rejection.
+        anywhere: Whether that was one of ``ANYWHERE``.
+        final: Whether this standstill is not judged again.
     """
 
     action: Measure
     since: float
     phase: str = "telling"
     said: str = ""
+    anywhere: bool = False
+    final: bool = False
 
     def next(self, phase: str) -> None:
         """Begin a phase."""
@@ -73,6 +86,7 @@ class Measuring:
         self._plans: dict[str, Announced] = {}
         self.visit: Visit | None = None
         self.waiting, self._waited_since, self._tried = "", 0.0, 0.0
+        self._spoilt = ""
 
     taken = ""
     _plan: Announced | None
@@ -89,7 +103,7 @@ class Measuring:
 
     def leave(self) -> None:
         """Nothing is to be measured now: the robot stops."""
-        self.visit = None
+        self.visit, self._spoilt = None, ""
         self._wait_for("")
         self._execution.poll(self._settings.silence)
         self._execution.cancel()
@@ -112,18 +126,28 @@ class Measuring:
             InputError: A measurement of other joints.
         """
         known = any(r.number == message.id for r in state.rows)
-        if message.status == Measurement.REJECTED_UNDONE and known:
-            return state.withdrawn(int(message.id), message.reason[:300] or "undone")
         if message.status not in (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER):
-            if self.visit is not None and self.visit.phase in ("moving", "judging"):
-                self.visit.said = message.reason[:300]
+            if known:
+                return state.withdrawn(int(message.id), message.reason[:300] or "undone")
+            self._rejected(message)
             return state
+        self._spoilt = ""
         plan = self._plans.get(message.plan_id)
         if known or plan is None or message.configuration_index >= len(plan.stops):
             return state
         points = np.array([[p.x, p.y, p.z] for p in message.points])
         stop = plan.stops[message.configuration_index]
         return state.measured(stop, _joints(message, state), points, int(message.id))
+
+    def _rejected(self, message: Measurement) -> None:
+        visit = self.visit
+        if visit is None or visit.phase not in ("moving", "judging"):
+            return
+        visit.said, visit.anywhere = message.reason[:300], message.status in ANYWHERE
+        # Points tell a standstill that was rejected from one that was none, and may become one yet.
+        plan, row = self._plans.get(message.plan_id), message.configuration_index
+        here = plan is not None and row < len(plan.stops) and plan.stops[row] == visit.action.index
+        visit.final = here and len(message.points) > 0
 
     # ── one step further ─────────────────────────────────────────────────────────────────────────────
 
@@ -144,7 +168,7 @@ class Measuring:
             self._tell(state, visit)
         elif visit.phase == "sending":
             self._send(visit)
-        elif time.monotonic() - visit.since > self._settings.patience:
+        elif visit.final or time.monotonic() - visit.since > self._settings.patience:
             return self._not_measured(state, visit)
         return state
 
@@ -206,12 +230,18 @@ class Measuring:
             self._wait_for(f"{name} is not there")
             visit.next("telling")
             return state
+        if visit.anywhere:
+            self.visit, self._spoilt = None, visit.said
+            self._wait_for("")
+            return state
         reason = visit.said or f"{name} said nothing within {self._settings.patience:g} s"
         self._node.get_logger().warning(f"configuration {visit.action.index}: {reason}")
         self.visit = None
         return state.failed(visit.action.index, reason)
 
     def _wait_for(self, what: str) -> None:
+        """For nothing, if it is empty, but that what spoils measurements passes."""
+        what = what or self._spoilt
         if what and not self.waiting:
             self._waited_since = self._tried = time.monotonic()
             self._node.get_logger().warning(f"waiting: {what}")

@@ -50,6 +50,7 @@ MEASUREMENT_STATUS = {
     Reason.MOVED.value: Measurement.REJECTED_MOVED,
     Reason.TOO_FEW_SAMPLES.value: Measurement.REJECTED_TOO_FEW_SAMPLES,
     Reason.TIME_SKEW.value: Measurement.REJECTED_TIME_SKEW,
+    Reason.OTHER_FRAME.value: Measurement.REJECTED_OTHER_FRAME,
     Reason.NOT_FINITE.value: Measurement.REJECTED_NOT_FINITE,
     "not_in_plan": Measurement.REJECTED_NOT_IN_PLAN,
     "outlier": Measurement.REJECTED_OUTLIER,

@@ -88,6 +88,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         chosen = self.settings.value
         joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
         self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
+        self._keep_frame()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         self.create_timer(chosen.diagnostics_period, self._tick, clock=steady)
         self._update()
@@ -123,9 +124,15 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self._model, self._campaign = model, Campaign(model.robot, model.follow, store)
         if self._intake is not None:
             self._intake.use(model.robot.joint_names)
+        self._keep_frame()
         if self._campaign.kept:
             text = f"campaign of plan {self._campaign.plan_id[:40]!r} goes on"
             self.get_logger().info(f"{text}: {len(self._campaign.kept)} measurements are in {store.path}")
+
+    def _keep_frame(self) -> None:
+        """Points are to come in the frame of those that are kept; if there are none, in any."""
+        if self._intake is not None:
+            self._intake.frame = "" if self._campaign is None else self._campaign.frame
 
     def _leave_campaign(self) -> None:
         if self._campaign is not None:
@@ -184,6 +191,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         name = f"plan {received.plan_id[:40]!r}"
         text = f"{name}: {received.plan.measurements} measurements, {len(campaign.kept)} of them there"
         self.get_logger().info(f"{text}; {before} were there of the plan before" if before else text)
+        self._keep_frame()
         self._update()
 
     def _refuse_plan(self, plan_id: str, error: CalibPlannerError) -> None:
@@ -228,11 +236,29 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             self._output.decision(campaign, decision)
             if decision.status == ACCEPTED:
                 self._update()
+        self._withdraw_misdated()
+
+    def _withdraw_misdated(self) -> None:
+        """What was accepted before it was seen that a clock is wrong does not count."""
+        campaign, intake, bound = self._campaign, self._intake, self.settings.value.clock_offset
+        rests = [] if campaign is None or intake is None else intake.misdated(bound)
+        if campaign is None or intake is None or not rests:
+            return
+        took = [(d, d.standstill.start, d.standstill.stop) for d in campaign.kept]
+        gone = [d for d, start, stop in took if any(a <= start and stop <= b for a, b in rests)]
+        try:
+            for decision in gone:
+                text = f"taken before it was seen: {intake.offset_text(bound)}"
+                self._output.decision(campaign, campaign.withdraw(decision, "clock_offset", text))
+        except StoreError as error:
+            self.get_logger().error(f"not withdrawn, tried again: {error}", throttle_duration_sec=5.0)
+        if gone:
+            self._update()
 
     def _update(self) -> None:
-        """Identify anew, publish it, and tell which measurements are seen otherwise now."""
+        """Identify anew, publish it, and tell which measurements are seen otherwise now; only while active."""
         campaign = self._campaign
-        if campaign is None:
+        if campaign is None or self._intake is None:
             return
         found = campaign.estimate(self._how)
         changed = campaign.judge()
@@ -246,6 +272,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         campaign, intake, chosen = self._campaign, self._intake, self.settings.value
         if campaign is not None and isinstance(campaign.store, UnavailableStore):
             self._reopen()
+        self._withdraw_misdated()
         if intake is not None:
             now, seconds = self.get_clock().now().nanoseconds, chosen.diagnostics_period
             health = intake.health(now, seconds)
@@ -287,6 +314,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
 
     def _reset(self, campaign: Campaign) -> str:
         count = campaign.reset()
+        self._keep_frame()
         self._update()
         return f"{count} measurements left behind; they stay in the store"
 

@@ -1,12 +1,13 @@
 """What comes in a thousand times per second: read cheaply, counted, searched for standstills.
 
 A joint state names its joints every time; where each is found is remembered as long as the names stay the same.
+Points of all targets are in one frame, the first one named: means of points in two frames would be of nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from geometry_msgs.msg import PointStamped
@@ -14,9 +15,11 @@ from sensor_msgs.msg import JointState
 
 from calib_planner._arrays import FloatArray
 from calib_planner.errors import InputError
+from calib_planner.files.campaign_records import LONGEST
 from calib_planner.instrument.joint_state import pick_joints
 from calib_planner.instrument.standstill import (
     NANO,
+    Reason,
     Rejection,
     Standstill,
     StandstillDetector,
@@ -106,6 +109,9 @@ class Intake:
         joint_names: The robot's joints; ``None``: not known yet, messages are counted only.
         joint_topic, topics: Names of the streams, a target each.
         settings: What counts as standing still.
+
+    Attributes:
+        frame: Points of other frames are refused; empty: the next frame named. Points that name none are taken.
     """
 
     def __init__(
@@ -125,6 +131,7 @@ class Intake:
         names = joint_names or ()
         self._reader = JointReader(names)
         targets = len(self.watches) - 1
+        self._other_frame = [""] * targets
         self.detector = StandstillDetector(len(names), targets, self._settings) if names else None
 
     def joints(self, message: JointState) -> list[Standstill | Rejection]:
@@ -141,20 +148,41 @@ class Intake:
         except InputError as error:
             watch.refuse(str(error))
             raise
-        return self.detector.add_joints(stamp, joints)
+        return self._explained(self.detector.add_joints(stamp, joints))
 
     def point(self, target: int, message: PointStamped) -> list[Standstill | Rejection]:
         """Take a point of a target, from 0; what it completes."""
-        stamp = nanoseconds(message.header.stamp)
-        if not self.watches[1 + target].usable(stamp) or self.detector is None:
+        stamp, watch, frame = nanoseconds(message.header.stamp), self.watches[1 + target], message.header.frame_id
+        if not watch.usable(stamp) or self.detector is None:
             return []
-        self.frame = message.header.frame_id or self.frame
+        if frame and frame != self.frame and not self._enter_frame(frame[:LONGEST]):
+            other = f"frame_id {frame[:40]!r}, the points before are in {self.frame[:40]!r}"
+            self._other_frame[target] = f"{other}: publish all in one frame, or call ~/reset"
+            watch.refuse(self._other_frame[target])
+            return []
+        self._other_frame[target] = ""
         p = message.point
-        return self.detector.add_point(target, stamp, np.array((p.x, p.y, p.z)))
+        return self._explained(self.detector.add_point(target, stamp, np.array((p.x, p.y, p.z))))
+
+    def _enter_frame(self, frame: str) -> bool:
+        self.frame = self.frame or frame
+        return self.frame == frame
+
+    def _explained(self, results: list[Standstill | Rejection]) -> list[Standstill | Rejection]:
+        """Without points, or with too few, because they were refused."""
+        text = next(filter(None, self._other_frame), "") if results else ""
+        if not text:
+            return results
+        named = {"reason": Reason.OTHER_FRAME, "message": text}
+        return [replace(r, **named) if isinstance(r, Rejection) else r for r in results]  # type: ignore[arg-type]
 
     def offset_text(self, bound: float) -> str:
         """Which clock is more than ``bound`` [s] off, in words; empty if none is."""
         return "" if self.detector is None else self.detector.offset_text(bound)
+
+    def misdated(self, bound: float) -> list[tuple[int, int]]:
+        """Rests [ns] at which a clock was more than ``bound`` [s] off, once it is known to be."""
+        return [] if self.detector is None else self.detector.misdated(bound)
 
     def health(self, now: int, seconds: float) -> list[StreamHealth]:
         """Every stream in the last ``seconds``, at the time ``now`` [ns]."""

@@ -1,0 +1,125 @@
+"""The identifier and streams that do not fit together: clocks that differ, points in another frame."""
+
+from __future__ import annotations
+
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bench import Bench
+from calib_planner_msgs.msg import Measurement
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PointStamped
+from test_identifier_node import Shift, change, spread
+
+from calib_planner import Plan, Robot
+from calib_planner.ros.conversions import plan_to_message
+from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.ros.qos import EVENTS
+
+CLOCK, FRAME = Measurement.REJECTED_CLOCK_OFFSET, Measurement.REJECTED_OTHER_FRAME
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot.load("planar_2r").with_parameters("lengths+offsets")
+
+
+@pytest.fixture
+def planned(robot: Robot) -> Plan:
+    return spread(20)
+
+
+def last_told(shift: Shift) -> dict[int, Measurement]:
+    return {m.id: m for m in shift.measurements if m.id}
+
+
+def test_clocks_that_differ_are_noticed_what_was_accepted_withdrawn_and_forgiven(
+    bench: Bench, robot: Robot, planned: Plan
+) -> None:
+    shift = Shift(bench, robot)
+    shift.announce(planned)
+    good = [shift.rest(q, 1.2).id for q in planned.configurations[:2]]
+    wrong = [shift.rest(q, 1.2, offset=0.3) for q in planned.configurations[2:8]]
+    assert wrong[0].status == Measurement.ACCEPTED and wrong[-1].status == CLOCK
+    bench.wait(lambda: sum(m.status == CLOCK for m in last_told(shift).values()) == 6)
+    told = last_told(shift)
+    assert [told[n].status for n in good] == [Measurement.ACCEPTED] * 2
+    withdrawn = told[wrong[0].id]
+    assert "before it was seen" in withdrawn.reason and "ms from the joints" in withdrawn.reason
+    bench.wait(lambda: shift.estimates[-1].configurations == 2)
+    assert [shift.rest(q, 1.2).status for q in planned.configurations[8:16]][-1] == Measurement.ACCEPTED
+
+
+def test_what_was_withdrawn_stays_withdrawn(bench: Bench, robot: Robot, planned: Plan, tmp_path: Path) -> None:
+    shift = Shift(bench, robot, store_folder=str(tmp_path))
+    shift.announce(planned)
+    for q in planned.configurations[:5]:
+        shift.rest(q, 1.2, offset=0.3)
+    bench.wait(lambda: {m.status for m in last_told(shift).values()} == {CLOCK})
+    for transition in ("deactivate", "cleanup", "configure", "activate"):
+        change(bench, transition)
+    assert shift.node._campaign.kept == []
+    assert shift.node._campaign.rejections["clock_offset"] == 5
+
+
+def test_points_in_another_frame_are_refused_with_the_reason(
+    bench: Bench, robot: Robot, planned: Plan, tmp_path: Path
+) -> None:
+    heard = bench.hear(DiagnosticArray, "/diagnostics", EVENTS)
+    shift = Shift(bench, robot, store_folder=str(tmp_path), diagnostics_period=0.1)
+    shift.announce(planned)
+    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
+    shift.frame = "elsewhere"
+    refused = shift.rest(planned.configurations[1], 3.2)
+    assert refused.status == FRAME and "'elsewhere'" in refused.reason and "'laser'" in refused.reason
+
+    def stream() -> DiagnosticStatus:
+        return next(s for s in heard[-1].status if s.name.endswith("stream tracker/point"))
+
+    bench.wait(lambda: heard and "'elsewhere'" in stream().message)
+    assert stream().level == DiagnosticStatus.WARN
+    shift.frame = ""  # not named: taken for what was named before
+    assert shift.rest(planned.configurations[2]).status == Measurement.ACCEPTED
+    for transition in ("deactivate", "cleanup", "configure", "activate"):
+        change(bench, transition)
+    shift.sent, shift.frame = 0, "elsewhere"  # a restart does not forget
+    assert shift.rest(planned.configurations[3], 3.2).status == FRAME
+    shift.frame = "laser"
+    assert shift.rest(planned.configurations[3]).status == Measurement.ACCEPTED
+    assert shift.service("reset").success
+    shift.frame = "elsewhere"
+    assert shift.rest(planned.configurations[0]).header.frame_id == "elsewhere"
+
+
+def test_a_frame_that_changes_within_a_standstill_is_not_averaged(
+    bench: Bench, robot: Robot, planned: Plan
+) -> None:
+    shift = Shift(bench, robot)
+    shift.announce(planned)
+    shift.rest(planned.configurations[0])
+    frames, send = chain(["laser"] * 15, repeat("elsewhere")), shift.send
+
+    def framed(publisher: Any, message: Any, ahead: int = 10) -> None:
+        if isinstance(message, PointStamped):
+            message.header.frame_id = next(frames)
+        send(publisher, message, ahead)
+
+    shift.send = framed  # type: ignore[method-assign]
+    found = shift.rest(planned.configurations[1], 3.2)
+    assert found.status == Measurement.ACCEPTED and found.header.frame_id == "laser"
+    assert 5 <= found.samples[0] <= 15  # of 160
+
+
+def test_an_inactive_identifier_does_not_seem_to_take_plans(bench: Bench, robot: Robot, planned: Plan) -> None:
+    shift = Shift(bench, robot)
+    change(bench, "deactivate")
+    count = len(shift.estimates)
+    shift.plans.publish(plan_to_message(planned, "other", 0, "base"))
+    node = shift.node
+    assert isinstance(node, IdentifierNode)
+    bench.wait(lambda: node._campaign.plan_id == "other")
+    assert len(shift.estimates) == count
+    change(bench, "activate")
+    bench.wait(lambda: shift.estimates[-1].plan_id == "other")
