@@ -145,5 +145,5 @@ def _undisturbed() -> Iterator[None]:
 
 
 def node_names() -> Sequence[str]:
-    """Modules of the three nodes."""
-    return ("planner_node", "identifier_node", "simulator_node")
+    """Modules of all nodes of this package."""
+    return ("planner_node", "identifier_node", "simulator_node", "campaign_node")

@@ -46,7 +46,7 @@ class FakeCell(Node):
         self.takes_plans = True
         self.plans: list[PlanMessage] = []
         self.visited: list[np.ndarray] = []
-        self.number = 0
+        self.number = self.stopped = 0
         self.closing = threading.Event()
         self._plan: PlanMessage | None = None
         self._rng = np.random.default_rng(1)
@@ -81,6 +81,7 @@ class FakeCell(Node):
             while not goal.is_cancel_requested and not self.closing.wait(0.02):
                 pass
             if goal.is_cancel_requested:
+                self.stopped += 1
                 goal.canceled()
             return kind(status=kind.CANCELLED, message="stopped on request")
         if answer in STATUS:

@@ -13,11 +13,13 @@ from pathlib import Path
 import pytest
 from bench import next_domain
 
+from calib_planner.ros import processes
 from calib_planner.ros.processes import Nodes, node_names
 
 PARENT = """
 import sys, time
 from pathlib import Path
+from calib_planner.ros import processes
 from calib_planner.ros.processes import Nodes
 
 nodes = Nodes(Path(sys.argv[1]), int(sys.argv[2]))
@@ -81,3 +83,8 @@ def test_a_module_that_is_none_is_refused() -> None:
     command = [sys.executable, "-m", "calib_planner.ros.child", "../planner_node"]
     ended = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert ended.returncode == 1 and "usage" in ended.stderr and "Traceback" not in ended.stderr
+
+
+def test_all_nodes_are_named() -> None:
+    here = Path(processes.__file__).parent
+    assert sorted(node_names()) == sorted(path.stem for path in here.glob("*_node.py"))

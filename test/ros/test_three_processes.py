@@ -19,7 +19,7 @@ from calib_planner import Robot
 from calib_planner.ros import demo
 from calib_planner.ros.conversions import estimate_from_message
 from calib_planner.ros.demo_client import DemoClient
-from calib_planner.ros.processes import Nodes, ProcessFailed, node_names
+from calib_planner.ros.processes import Nodes, ProcessFailed
 from calib_planner.simulation import random_deviations
 
 SEED = 11
@@ -49,7 +49,7 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
             assert client.save().startswith("saved ")
         finally:
             client.close()
-        assert nodes.end(signal.SIGINT) == dict.fromkeys(node_names(), 0), nodes.logs()
+        assert nodes.end(signal.SIGINT) == dict.fromkeys(nodes.processes, 0), nodes.logs()
         for name, text in nodes.logs().items():
             assert "Traceback" not in text, (name, text)
     assert final.status == CalibrationEstimate.STATUS_OK and final.complete

@@ -1,0 +1,69 @@
+"""The person at a campaign: calls its services, hears its status."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench import Bench
+from calib_planner_msgs.msg import CampaignStatus
+from std_srvs.srv import Trigger
+
+from calib_planner.ros.campaign_node import CampaignNode
+from calib_planner.ros.qos import LATCHED
+
+NAME = "calibration_campaign"
+ASKED = {
+    "robot": "planar_2r",
+    "test_poses": "0.17 0.87",
+    "required_accuracy": 5e-6,
+    "starts": 4,
+    "validation": 3,
+    "budget": 40,
+}
+S = CampaignStatus
+
+
+class Desk:
+    """Starts the node with these parameters, in this process, unless it is ``elsewhere``."""
+
+    def __init__(self, bench: Bench, *, elsewhere: bool = False, **parameters: Any) -> None:
+        self.bench = bench
+        self.heard = bench.hear(S, f"{NAME}/status", LATCHED)
+        create = bench.client.create_client
+        self.clients = {name: create(Trigger, f"{NAME}/{name}") for name in ("start", "pause", "resume", "skip")}
+        if not elsewhere:
+            self.node = bench.start(CampaignNode, **(ASKED | parameters))
+            bench.wait(lambda: self.heard)
+            for name in ("pause", "resume", "skip"):  # refused: nothing was begun; discovery is through then
+                assert not self.call(name)[0]
+
+    def call(self, name: str) -> tuple[bool, str]:
+        """A first call may be answered before discovery has matched its reader: then it is repeated."""
+        client = self.clients[name]
+        self.bench.wait(client.service_is_ready)
+        for _ in range(3):
+            future = client.call_async(Trigger.Request())
+            try:
+                response = self.bench.future(future, 5.0)
+            except AssertionError:
+                client.remove_pending_request(future)
+                continue
+            return response.success, response.message
+        raise AssertionError(f"{name} is not answered")
+
+    @property
+    def now(self) -> CampaignStatus:
+        return self.heard[-1]
+
+    def until(self, state: int, seconds: float = 30.0, **fields: Any) -> CampaignStatus:
+        """The first status from now on in that state with these fields, or with at least these counts."""
+
+        def there() -> bool:
+            m = self.now
+            return m.state == state and all(getattr(m, k) >= v for k, v in fields.items())
+
+        try:
+            self.bench.wait(there, seconds)
+        except AssertionError:
+            raise AssertionError(f"not in state {state} within {seconds} s: {self.now}") from None
+        return self.now

@@ -1,0 +1,86 @@
+"""The campaign node as a process that is told to end: the robot stops, a restart goes on with the campaign."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from bench import Bench
+from desk import ASKED, Desk, S
+from fake_cell import FakeCell
+
+from calib_planner.files.campaign_journal import FILE
+from calib_planner.ros.processes import Nodes
+
+NODE = "campaign_node"
+
+
+class Restarts:
+    """The node, again and again, over one store; each time it ends with status 0 and no traceback."""
+
+    def __init__(self, bench: Bench, folder: Path) -> None:
+        self.bench, self.folder, self.number = bench, folder, 0
+        self.nodes: Nodes | None = None
+
+    def start(self, **parameters: object) -> None:
+        self.number += 1
+        self.nodes = Nodes(self.folder / str(self.number), self.bench.domain)
+        self.nodes.start(NODE, ASKED | {"store_folder": str(self.folder / "store")} | parameters)
+        self.bench.wait(lambda: "call ~/" in self.log, 60.0)
+
+    @property
+    def log(self) -> str:
+        return (self.folder / str(self.number) / f"{NODE}.log").read_text()
+
+    def end(self, number: signal.Signals) -> None:
+        assert self.nodes is not None
+        assert self.nodes.end(number) == {NODE: 0}, self.nodes.logs()
+        assert "Traceback" not in self.log and "Error" not in self.log, self.log
+
+    def measured(self) -> list[int]:
+        """Numbers of the measurements in the journal; every line of it is whole."""
+        lines = [json.loads(line) for line in (self.folder / "store" / FILE).read_text().splitlines()]
+        return [line["measured"] for line in lines if "measured" in line]
+
+
+@pytest.fixture
+def runs(bench: Bench, tmp_path: Path) -> Iterator[Restarts]:
+    made = Restarts(bench, tmp_path)
+    yield made
+    if made.nodes is not None:
+        made.nodes.end(signal.SIGKILL)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_told_to_end_the_robot_stops_and_a_restart_goes_on(
+    bench: Bench, runs: Restarts, number: signal.Signals
+) -> None:
+    cell = bench.start(FakeCell)
+    cell.answer = lambda q: "hang" if len(cell.visited) == 5 else "ok"
+    desk = Desk(bench, elsewhere=True)
+    runs.start()
+    assert desk.call("start")[0]
+    told = desk.until(S.MEASURING, 60.0, measured=4)
+    bench.wait(lambda: len(cell.visited) == 5)
+    runs.end(number)
+    bench.wait(lambda: cell.stopped == 1)
+    assert runs.measured() == [1, 2, 3, 4]
+
+    long = number == signal.SIGTERM
+    runs.start(**({"starts": 100_000, "time_limit": 600.0} if long else {}))
+    again = desk.until(S.PAUSED, 60.0, measured=4)
+    assert again.campaign_id == told.campaign_id and "resume" in again.reason and len(cell.visited) == 5
+    assert desk.call("pause")[0] and desk.call("resume")[0]
+    if long:  # it plans
+        desk.until(S.PLANNING, 60.0, measured=4)
+        runs.end(number)
+        assert runs.measured() == [1, 2, 3, 4]
+        runs.start()
+        assert desk.call("pause")[0] and desk.call("resume")[0]
+    done = desk.until(S.DONE, 60.0)
+    assert done.outcome == S.OUTCOME_REACHED and done.campaign_id == told.campaign_id
+    runs.end(number)
+    assert len(runs.measured()) == done.measured + done.validated
