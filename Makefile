@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test docs lint bench soak clean
+.PHONY: help setup demo test docs lint bench soak faults clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -29,6 +29,9 @@ bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (m
 
 soak: setup ## the identifier at 1 kHz for 10 minutes: none lost, memory flat (SOAK='--minutes 2'; JSON to results/)
 	@mkdir -p results; . ./env.sh && python bench/soak.py $(SOAK) > results/soak.json
+
+faults: setup ## every fault × 20 seeds through the nodes: an hour or two (FAULTS='--seeds 2'; JSON to results/)
+	@mkdir -p results; . ./env.sh && python bench/campaign_faults.py $(FAULTS) > results/campaign_faults.json
 
 clean: ## remove what was made: .venv, build, install, log, caches
 	rm -rf .venv build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -252,7 +252,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         if isinstance(action, Measure):
             self._set(measuring.step(state, action))
             if measuring.waited > self.settings.value.longest_wait:
-                self._pause_for(f"{measuring.waiting}; call ~/resume when it is")
+                self._pause_for(f"{measuring.waiting}; call ~/resume once that is remedied")
             return
         measuring.leave()
         if isinstance(action, Finished):

@@ -38,13 +38,16 @@ class DemoClient:
     Args:
         domain: ROS domain id.
         check: Called while waiting; raises if something is wrong, e.g. a node has ended.
+        name: Of the node.
     """
 
-    def __init__(self, domain: int, check: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, domain: int, check: Callable[[], None] = lambda: None, name: str = "calibration_demo"
+    ) -> None:
         self._check = check
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain)
-        self._node = Node("calibration_demo", context=self._context)
+        self._node = Node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.estimate: CalibrationEstimate | None = None

@@ -64,6 +64,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         self._busy, self._closing = threading.Lock(), threading.Event()
+        self._present = threading.Lock()  # what was sampled is past: a tour begins and ends after it
         super().__init__("tracker_simulator", SimulatorParameters(), context, overrides)
 
     # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
@@ -116,7 +117,9 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def _publish(self) -> None:
         names, frame = self.world.robot.joint_names, self.settings.value.frame_id
-        for message in self._streams.advance(self._now()):
+        with self._present:
+            messages = self._streams.advance(self._now())
+        for message in messages:
             if message.stream:
                 point = point_message(message.values, message.stamp, frame)
                 self._point_publishers[message.stream - 1].publish(point)
@@ -155,9 +158,8 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         if not 0 <= dwell <= 600:
             raise InputError("dwell", dwell, "0 (the node's default) to 600 s")
         check_executable(plan, self.world.robot)
-        began = self._now()
         tour = make_tour(
-            self._itinerary.at(np.array([began])).joints[0],
+            self._itinerary.at(np.array([self._now()])).joints[0],
             plan.configurations,
             plan.repetitions,
             self.world.robot.joint_limits,
@@ -165,10 +167,13 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             dwell or self.settings.value.dwell,
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
-        execution = Execution(tour, began)
-        self._itinerary.begin(tour, began)
-        stopped = self._watch(goal, execution, len(plan.configurations))
-        self._itinerary.stop(stopped)
+        with self._present:
+            execution = Execution(tour, self._now())
+            self._itinerary.begin(tour, execution.began)
+        self._watch(goal, execution, len(plan.configurations))
+        with self._present:
+            stopped = self._now()
+            self._itinerary.stop(stopped)
         result.executed = tour.standstills(execution.seconds(stopped))
         if self._closing.is_set():
             return result
@@ -180,14 +185,13 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             goal.succeed()
         return result
 
-    def _watch(self, goal: ServerGoalHandle, execution: Execution, total: int) -> int:
-        """Send feedback until the end or a cancellation; returns the stamp [ns] of that."""
+    def _watch(self, goal: ServerGoalHandle, execution: Execution, total: int) -> None:
+        """Send feedback until the end or a cancellation."""
         while True:
-            stamp = self._now()
-            seconds = execution.seconds(stamp)
+            seconds = execution.seconds(self._now())
             ended = seconds >= execution.tour.seconds or goal.is_cancel_requested
             if ended or self._closing.is_set():
-                return stamp
+                return
             phase = execution.tour.at(seconds)
             words = "measuring" if phase.measuring else "moving"
             goal.publish_feedback(
