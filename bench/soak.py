@@ -1,6 +1,11 @@
 """Soak of the identifier node: joint states and tracker points at 1 kHz each, for minutes, none may be lost.
 
     python bench/soak.py [--minutes 10] [--rate 1000] [--stored 200] [--period 3]
+        [--parameters lengths+offsets] [--unknown base,tool] [--erring 0.0001]
+
+``--parameters`` are those of a KR-270 that are identified, ``--unknown`` what else is not known beforehand:
+``full`` with ``base,tool`` are 45. ``--erring`` is the standard deviation of errors that the joints have besides
+[rad]: no geometry explains them, and a discrepancy is estimated, as on a real robot.
 
 The node runs in a process of its own, with a campaign of ``--stored`` configurations in its store on disk; this
 process is robot and tracker: it drives to a configuration, stands still, goes on, every ``--period`` seconds, and
@@ -53,6 +58,7 @@ from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.simulation import random_deviations
 
 ROBOT, SIGMA, MOVE = "kuka_kr270", 3e-5, 1.0
+TARGET = [[0.05, 0.02, 0.12]]
 NODE = "calibration_identifier"
 STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -93,18 +99,20 @@ def nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * NANO + int(stamp.nanosec)
 
 
-def prepare(folder: Path, stored: int, more: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
+def prepare(chosen: argparse.Namespace, folder: Path, more: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """A campaign with ``stored`` measurements on disk; joints and points of ``more`` configurations to go."""
-    settings = IdentifierParameters(robot=ROBOT, store_folder=str(folder), sigma=SIGMA)
+    stored, asked = chosen.stored, {"parameters": chosen.parameters, "unknown": chosen.unknown}
+    settings = IdentifierParameters(robot=ROBOT, store_folder=str(folder), sigma=SIGMA, **asked)
     model = first_model(settings)
     assert model is not None
-    robot = Robot.load(ROBOT).with_parameters("lengths+offsets")
+    robot = Robot.load(ROBOT).with_parameters(chosen.parameters)
+    robot = robot.with_targets(TARGET) if "tool" in chosen.unknown else robot
     real = robot.with_deviations(random_deviations(robot, 1))
     rng = np.random.default_rng(1)
     low, high = robot.joint_limits.T
     q = rng.uniform(low, high, (stored + more, len(low)))
-    points = real.positions(q)[:, 0]
-    promised = plan(PlanProblem(robot, [q[0]], 5, sigma=SIGMA, starts=1))
+    points = real.positions(q + chosen.erring * rng.standard_normal(q.shape))[:, 0]
+    promised = plan(PlanProblem(robot.with_parameters("lengths+offsets"), [q[0]], 5, sigma=SIGMA, starts=1))
     found = replace(promised, configurations=q, repetitions=np.ones(len(q), dtype=int))
     store = open_store(str(folder), model.stored, asdict(settings), __version__)
     campaign = Campaign(model.robot, model.follow, store)
@@ -221,9 +229,10 @@ def drive(
 def soak(chosen: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """The figures."""
     seconds, domain = 60.0 * chosen.minutes, own_domain()
-    q, points, names = prepare(folder / "store", chosen.stored, int(seconds / chosen.period) + 2)
+    q, points, names = prepare(chosen, folder / "store", int(seconds / chosen.period) + 2)
     with Nodes(folder / "log", domain) as nodes:
         given = {"robot": ROBOT, "store_folder": f"'{folder / 'store'}'", "sigma": SIGMA}
+        given |= {"parameters": chosen.parameters, "unknown": f"'{chosen.unknown}'"}
         nodes.start("identifier_node", given)
         cell = Cell(domain, names)
         cell.start()
@@ -290,6 +299,9 @@ def main() -> int:
     parser.add_argument(
         "--period", type=float, default=3.0, help="time per configuration, a second of it driving [s]"
     )
+    parser.add_argument("--parameters", default="lengths+offsets", help="what is identified")
+    parser.add_argument("--unknown", default="", help="base, tool, base,tool or nothing")
+    parser.add_argument("--erring", type=float, default=0.0, help="errors of the joints' own [rad]")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         found = soak(chosen, Path(name))

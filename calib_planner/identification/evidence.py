@@ -20,6 +20,7 @@ from calib_planner.identification.estimate import (
 from calib_planner.identification.hidden_errors import HiddenErrors
 from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.motion import Motion
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.order_check import Disturbance
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
@@ -73,8 +74,8 @@ def estimate_of(evidence: Evidence) -> Estimate:
     std[kept] = np.sqrt(np.diag(evidence.covariance)[kept])
     predicted = evidence.equations.motion.at(fit.deviations)[0]
     residuals = data.p - predicted
-    before = fit_placement(robot, data, evidence.equations).positions(data.q)
     use = evidence.equations.use
+    before = _placed_positions(evidence)
     held = [i for i in evidence.identifiability.held if i not in evidence.resolved]
     combination = dict(zip(evidence.identifiability.held, evidence.identifiability.combinations, strict=True))
     status = "rank_deficient" if held else "ok"
@@ -133,24 +134,40 @@ def estimate_of(evidence: Evidence) -> Estimate:
     )
 
 
-def fit_placement(robot: Robot, data: Measurements, equations: Equations | None = None) -> Robot:
+def fit_placement(robot: Robot, data: Measurements) -> Robot:
     """The nominal kinematics with base and targets fitted to the data where they are unknown.
 
     Args:
         robot: At its closed-form start.
-        data: The measurements.
-        equations: Says which points count and how; all alike by default.
+        data: The measurements, all of which count alike.
     """
-    names = robot.parameter_names
-    placement = [n for n in names if n.startswith(("base.", "target_"))]
-    if not placement:
+    if not _placement(robot):
         return robot
-    use = data.seen if equations is None else equations.use
-    fitted = robot.with_parameters(placement)
+    motion, deviations = _placed(robot, data, data.seen)
+    return robot.with_deviations(dict(zip(motion.robot.parameter_names, deviations, strict=True)))
+
+
+def _placement(robot: Robot) -> list[str]:
+    """Names of the unknown base's and targets' parameters."""
+    return [n for n in robot.parameter_names if n.startswith(("base.", "target_"))]
+
+
+def _placed(robot: Robot, data: Measurements, use: NDArray[np.bool_]) -> tuple[Motion, FloatArray]:
+    """The nominal kinematics moved by its placement alone; deviations of that which fit the points ``use``."""
+    fitted = robot.with_parameters(_placement(robot))
     unit = np.broadcast_to(UNKNOWN_SIGMA**2 * np.eye(3), (*data.p.shape, 3))
     alike = Equations(fitted, data, use, point_whitening(unit, use))
-    fit = gauss_newton(alike, np.zeros(len(placement)), tuple(range(len(placement))), 50, gain=PLACED)
-    return robot.with_deviations(dict(zip(placement, fit.deviations, strict=True)))
+    count = len(fitted.parameter_names)
+    fit = gauss_newton(alike, np.zeros(count), tuple(range(count)), 50, gain=PLACED)
+    return alike.motion, fit.deviations
+
+
+def _placed_positions(evidence: Evidence) -> FloatArray:
+    """(N, targets, 3) of the nominal kinematics, placed by the points in use [m]."""
+    if not _placement(evidence.robot):
+        return evidence.equations.motion.at(np.zeros(len(evidence.robot.parameter_names)))[0]
+    motion, deviations = _placed(evidence.robot, evidence.problem.data, evidence.equations.use)
+    return motion.at(deviations)[0]
 
 
 def distances(residuals: FloatArray) -> FloatArray:
@@ -183,6 +200,8 @@ def _accuracy(evidence: Evidence, poses: FloatArray) -> tuple[FloatArray, FloatA
 def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
     """(K,) whether a pose moves with a combination that was held because hardly any measured point does."""
     held = [k for k, i in enumerate(evidence.identifiability.held) if i not in evidence.resolved]
+    if not held:
+        return np.zeros(len(poses), bool)
     directions = evidence.identifiability.directions[held].T
     seen = np.linalg.norm(evidence.jacobian @ directions, axis=2).max(axis=(0, 1))
     there = np.linalg.norm(evidence.robot.jacobian(poses, evidence.at) @ directions, axis=1)

@@ -31,6 +31,8 @@ FAR = 0.05
 """What hardly any point sees is kept this close to the start while points are selected [m | rad]."""
 BENT = 0.01
 """Points this far from where a step's Jacobian sent them, in standard deviations, need another Jacobian."""
+SETTLED = 0.01
+"""Weights that change by less do not move a point through the gate; those near it are judged again by the fit."""
 LEAST_SCALE = 1e-8
 """Least variance that residuals without any freedom are taken to have, in units of the instrument's."""
 MEDIAN = float(chi2.median(3))
@@ -111,7 +113,7 @@ def select(
         step = np.linalg.lstsq(rows / length, right, rcond=1e-12)[0] / length
         deviations = deviations.copy()
         deviations[columns] += step
-        settled = np.abs(new - weights).max() < 1e-4
+        settled = np.abs(new - weights).max() < SETTLED
         weights = new
         if settled:
             break

@@ -12,7 +12,7 @@ measurements there are and on nothing else, which makes it the same after a rest
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -301,10 +301,14 @@ class Campaign:
 
         What cannot be written now is written with the next: the data it follows from are there.
         """
-        rejected = self.newest.rejected if isinstance(self.newest, Estimate) else ()
+        rejected = defaultdict(list)
+        for point in self.newest.rejected if isinstance(self.newest, Estimate) else ():
+            rejected[point["row"]].append(point)
         changed = []
         for row, before in enumerate(self.kept):
-            own = [r for r in rejected if r["row"] == row]
+            own = rejected[row]
+            if not own and before.status == ACCEPTED and not before.unused:
+                continue
             unused = tuple(sorted(int(r["target"]) - 1 for r in own))
             seen = int((before.standstill.samples > 0).sum())
             status = OUTLIER if own and len(own) == seen else ACCEPTED
