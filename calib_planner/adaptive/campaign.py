@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 FIT, VALIDATION, FINISHED = "fit", "validation", "finished"
 PHASES = (FIT, VALIDATION, FINISHED)
+LARGEST = 1e5
+"""Coordinates beyond this [m | rad] are no measurement, and their squares would spoil every fit to come."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +201,7 @@ class CampaignState:
             points: (targets, 3) [m], NaN where a target was not seen; (3,) will do for one target.
 
         Raises:
-            InputError: No such stop, wrong shape, not finite, no target seen at all.
+            InputError: No such stop, wrong shape, not a robot's numbers, no target seen at all.
         """
         self._check_index(index)
         robot = self.problem.robot
@@ -209,6 +211,10 @@ class CampaignState:
         clean = check_array(
             "points", shaped, (len(robot.targets), 3), finite=False, meaning="(targets, xyz) in m"
         )
+        for name, values in (("q", joints), ("points", clean)):
+            if (np.abs(values) > LARGEST).any():
+                got = f"{np.nanmax(np.abs(values)):.3g}"
+                raise InputError(name, got, f"at most {LARGEST:g}, in m or rad", "look at who sends it")
         if np.isnan(clean).all():
             raise InputError("points", "NaN only", "at least one target that was seen", "report it as failed")
         if number is None:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.adaptive.campaign import FIT, CampaignState, Row, from_measurements
+from calib_planner.adaptive.campaign import FIT, VALIDATION, CampaignState, Row, from_measurements
 from calib_planner.adaptive.exclusion import Exclusion
 from calib_planner.adaptive.problem import CampaignProblem
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, StoreError
@@ -150,7 +150,7 @@ def open_journal(folder: str | Path, robot: Robot) -> Stored | None:
     _check_robot(path, lines[0], robot)
     try:
         return _folded(Journal(path), lines, robot)
-    except (KeyError, TypeError, ValueError, CalibPlannerError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, CalibPlannerError) as error:
         raise FileFormatError(path, "events", str(error)[:200], WHAT, "move the file away") from None
 
 
@@ -160,8 +160,10 @@ def _folded(journal: Journal, lines: list[dict[str, Any]], robot: Robot) -> Stor
     finished = ""
     for line in lines[1:]:
         if "measured" in line:
-            number = int(line["measured"])
-            rows[number] = (number, str(line["role"]), list(line["configuration"]), list(line["points"]))
+            number, role = int(line["measured"]), str(line["role"])
+            if role not in (FIT, VALIDATION):
+                raise InputError("role", role[:100], f"{FIT} or {VALIDATION}")
+            rows[number] = (number, role, list(line["configuration"]), list(line["points"]))
         elif "withdrawn" in line:
             rows.pop(int(line["withdrawn"]), None)
         elif "excluded" in line:
@@ -197,7 +199,7 @@ def _exclusion_line(out: Exclusion) -> dict[str, Any]:
 def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:
     try:
         found = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
         raise FileFormatError(path, f"line {number}", ascii(line[:40]), WHAT, "move the file away")

@@ -120,7 +120,8 @@ def world_point(q: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("index", "points", "field"),
     [(99, POINTS, "index"), (-1, POINTS, "index"), (0, np.full((1, 3), np.nan), "points"),
-     (0, np.zeros((2, 3)), "points"), (0, "x", "points|float")],
+     (0, np.zeros((2, 3)), "points"), (0, "x", "points|float"), (0, np.full((1, 3), np.inf), "points"),
+     (0, np.array([[np.nan, 0.0, -1e308]]), "points")],
 )  # fmt: skip
 def test_nonsense_is_refused(planned, index, points, field):
     with pytest.raises((InputError, ValueError), match=field):

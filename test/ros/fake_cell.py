@@ -26,14 +26,14 @@ from calib_planner.simulation import SimulatedCell, random_deviations
 
 Answer = Callable[[np.ndarray], str]
 KIND = ExecutePlan.Result
-STATUS = {"refuse": KIND.INVALID_PLAN, "abort": KIND.ABORTED, "busy": KIND.BUSY}
+STATUS = {"refuse": KIND.INVALID_PLAN, "abort": KIND.ABORTED, "busy": KIND.BUSY, "nonsense": 255}
 
 
 class FakeCell(Node):
     """``answer`` says what becomes of a configuration (joints,):
 
-    ``ok``, ``refuse`` (INVALID_PLAN), ``abort``, ``busy``, ``reject`` (measured, not accepted), ``ignore``
-    (nothing is published), ``hang`` (no end and no feedback until cancelled).
+    ``ok``, ``refuse`` (INVALID_PLAN), ``abort``, ``busy``, ``nonsense`` (no status there is), ``reject``
+    (measured, not accepted), ``ignore`` (nothing is published), ``hang`` (no end, no feedback until cancelled).
     """
 
     THREADS = 3
@@ -85,8 +85,13 @@ class FakeCell(Node):
                 goal.canceled()
             return kind(status=kind.CANCELLED, message="stopped on request")
         if answer in STATUS:
+            if answer == "nonsense":
+                goal.publish_feedback(
+                    ExecutePlan.Feedback(index=2**32 - 1, phase="x" * 10**6, seconds=float("nan"))
+                )
             goal.abort()
-            return kind(status=STATUS[answer], message=f"cannot go there: {answer}")
+            words = "x" * 10**6 if answer == "nonsense" else f"cannot go there: {answer}"
+            return kind(status=STATUS[answer], message=words)
         if answer != "ignore":
             self.publish(q, accepted=answer == "ok")
         goal.succeed()

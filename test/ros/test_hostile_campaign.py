@@ -1,0 +1,345 @@
+"""Anyone on the graph may send anything to the campaign node, too; a robot may answer anything.
+
+A campaign is under way, its robot at a configuration. After every attack the node answers, the campaign stands
+where it stood, and nothing was written elsewhere; at the end it is measured to its end.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bench import Bench
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from desk import ASKED, NAME, Desk, S
+from fake_cell import FakeCell
+from geometry_msgs.msg import Point
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Log, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.qos import QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from test_hostile_peer import BIG, PATHS, text_parameter, urdfs
+
+from calib_planner.errors import InputError
+from calib_planner.files.campaign_journal import FILE, FORMAT
+from calib_planner.ros.campaign_node import CampaignNode
+from calib_planner.ros.qos import EVENTS, LATCHED
+
+IDENTIFIER = "calibration_identifier"
+NAN, INF = float("nan"), float("inf")
+
+
+class Attack:
+    """A campaign under way, and a peer that hears its plan and sends what it likes."""
+
+    def __init__(self, bench: Bench, folder: Path) -> None:
+        self.bench, self.folder = bench, folder
+        self.outside = folder / "outside"
+        self.outside.mkdir()
+        (self.outside / "secret.txt").write_text("0123-secret")
+        self.cell = bench.start(FakeCell)
+        self.held = True
+        self.cell.answer = lambda q: "hang" if self.held and len(self.cell.visited) > 3 else "ok"
+        self.logs = bench.hear(Log, "/rosout", QoSProfile(depth=1000))
+        create = bench.client.create_publisher
+        self.measurements = create(Measurement, f"{IDENTIFIER}/measurements", EVENTS)
+        self.estimates = create(CalibrationEstimate, f"{IDENTIFIER}/estimate", LATCHED)
+        self.descriptions = create(String, "robot_description", LATCHED)
+        self.desk = Desk(bench, store_folder=str(folder / "store"), silence=600.0)
+        for publisher in (self.measurements, self.estimates, self.descriptions):
+            bench.wait(publisher.get_subscription_count)
+        self.errors: list[str] = []
+        self.watch()
+        assert self.desk.call("start")[0]
+        self.stuck()
+
+    @property
+    def node(self) -> Any:
+        return self.desk.node
+
+    def stuck(self) -> None:
+        """Until the robot hangs at the fourth configuration."""
+        self.desk.until(S.MEASURING, measured=3)
+        self.bench.wait(lambda: self.node._measuring.visit and self.node._measuring.visit.phase == "moving")
+
+    def message(self, **changes: Any) -> Measurement:
+        """A measurement of the configuration that the robot is at, but for ``changes``."""
+        plan, visit = self.cell._plan, self.node._measuring.visit
+        point = Point(x=1.0, y=0.1, z=0.0)
+        usual = {
+            "id": 10**6,
+            "plan_id": plan.plan_id,
+            "configuration_index": self.node._measuring._plan.stops.index(visit.action.index),
+            "joint_names": ["q1", "q2"],
+            "joint_positions": visit.action.q.tolist(),
+            "points": [point],
+            "status": Measurement.ACCEPTED,
+        }
+        return Measurement(**(usual | changes))
+
+    def refused(self, send: Callable[[], None], *words: str) -> None:
+        """Send until the node says on the log why it refuses; it does so at most once a second."""
+        known, deadline = len(self.logs), time.monotonic() + 20.0
+        while time.monotonic() < deadline:
+            send()
+            time.sleep(0.3)
+            for line in self.logs[known:]:
+                if line.name == NAME and line.level >= 30 and all(word in line.msg for word in words):
+                    assert len(line.msg) < 3000 and "0123" not in line.msg
+                    return
+        raise AssertionError(f"did not say {words}: {[m.msg[:200] for m in self.logs[known:]][-5:]}")
+
+    def watch(self) -> None:
+        """Keep what the node refuses of measurements, which is more than it says."""
+        heard = self.node._measuring.heard
+
+        def hear(message: Measurement, state: Any) -> Any:
+            try:
+                return heard(message, state)
+            except InputError as error:
+                self.errors.append(str(error))
+                raise
+
+        self.node._measuring.heard = hear
+
+    def check(self) -> None:
+        """The node is at work and answers; the campaign stands where it stood; nothing was written elsewhere."""
+        ok, text = self.desk.call("start")
+        assert not ok and "not finished" in text
+        state = self.node.campaign
+        assert self.node.is_active and len(state.rows) == 3 and not state.exclusions and not state.failures
+        assert (self.desk.now.state, self.desk.now.measured) == (S.MEASURING, 3)
+        assert len(self.desk.now.reason) <= 1000
+        assert [p.name for p in self.outside.iterdir()] == ["secret.txt"]
+        assert {p.name for p in self.folder.iterdir()} == {"outside", "store"}
+        assert [p.name for p in (self.folder / "store").iterdir()] == [FILE]
+        assert not any("secret" in line.msg or "Traceback" in line.msg for line in self.logs)
+
+
+@pytest.fixture(scope="module")
+def attack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attack]:
+    with Bench() as bench:
+        yield Attack(bench, tmp_path_factory.mktemp("campaign"))
+
+
+# ── who says to be the identifier ────────────────────────────────────────────────────────────────────
+
+REFUSED: dict[str, dict[str, Any]] = {
+    "10 000 joints": {"joint_names": [f"j{i}" for i in range(10_000)], "joint_positions": [0.0] * 10_000},
+    "a million positions": {"joint_positions": [0.0] * BIG},
+    "too few": {"joint_positions": [0.1]},
+    "no joints": {"joint_names": [], "joint_positions": []},
+    "twice": {"joint_names": ["q1", "q1"]},
+    "empty names": {"joint_names": ["", ""]},
+    "a long name": {"joint_names": ["q1", "x" * BIG]},
+    "NaN": {"joint_positions": [NAN, NAN]},
+    "infinite": {"joint_positions": [INF, 0.0]},
+    "no points": {"points": []},
+    "100 000 points": {"points": [Point()] * 100_000},
+    "NaN points": {"points": [Point(x=NAN, y=NAN, z=NAN)]},
+    "infinite points": {"points": [Point(x=INF)]},
+    "points far beyond": {"points": [Point(x=1e308, y=NAN, z=-1e308)]},
+    "joints far beyond": {"joint_positions": [1e308, 0.0]},
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_measurements(attack: Attack, case: str) -> None:
+    attack.errors.clear()
+    attack.measurements.publish(attack.message(**REFUSED[case]))
+    attack.bench.wait(lambda: attack.errors)
+    attack.check()
+
+
+def test_what_is_refused_is_said(attack: Attack) -> None:
+    message = attack.message(points=[])
+    attack.refused(lambda: attack.measurements.publish(message), "measurement refused", "points")
+    description = String(data="<robot")
+    words = "robot_description refused", "well-formed", "planar_2r stays the robot"
+    attack.refused(lambda: attack.descriptions.publish(description), *words)
+
+
+IGNORED: dict[str, dict[str, Any]] = {
+    "another plan": {"plan_id": "another"},
+    **{f"plan {p[:16]!r}": {"plan_id": p.replace("\0", "")} for p in PATHS},
+    "no such row": {"configuration_index": 2**32 - 1},
+    "no status": {"status": 255},
+    "undone, unknown": {"status": Measurement.REJECTED_UNDONE, "id": 2**64 - 1},
+    "a long reason": {"status": Measurement.REJECTED_MOVED, "reason": "x" * BIG},
+    "told already": {"id": 1},
+}
+
+
+@pytest.mark.parametrize("case", IGNORED)
+def test_measurements_of_nothing(attack: Attack, case: str) -> None:
+    heard = len(attack.desk.heard)
+    for _ in range(3):
+        attack.measurements.publish(attack.message(**IGNORED[case]))
+    attack.check()
+    assert len(attack.desk.heard) - heard <= 3
+
+
+def test_estimates(attack: Attack) -> None:
+    for text in (*PATHS, "", "x"):
+        attack.estimates.publish(
+            CalibrationEstimate(plan_id=text.replace("\0", ""), covariance=[NAN] * 10_000, value=[INF] * 10)
+        )
+    attack.check()
+    attack.estimates.publish(CalibrationEstimate(plan_id=attack.cell._plan.plan_id))
+
+
+# ── descriptions, parameters, transitions ────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("case", urdfs(Path("x")))
+def test_descriptions(attack: Attack, case: str) -> None:
+    attack.node._source.refusal = ""
+    attack.descriptions.publish(String(data=urdfs(attack.outside / "secret.txt")[case]))
+    attack.bench.wait(lambda: attack.node._source.refusal)
+    assert "planar_2r stays the robot" in attack.node._source.refusal
+    assert "0123" not in attack.node._source.refusal
+    attack.check()
+
+
+def test_parameters(attack: Attack) -> None:
+    names = (
+        "budget",
+        "required_accuracy",
+        "test_poses",
+        "sigma",
+        "patience",
+        "silence",
+        "longest_wait",
+        "starts",
+    )
+    numbers = ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[0.0] * BIG)
+    nan = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=NAN)
+    fixed = ("store_folder", "constraints_folder", "robot", "execute_action", "identifier")
+    paths = [p for p in PATHS if "\0" not in p]
+    for given in (
+        [text_parameter("x" * BIG, "x")],
+        [text_parameter(f"p{i}", "x") for i in range(10_000)],
+        [text_parameter(name, p[:1000]) for name in fixed for p in paths],
+        [text_parameter("test_poses", p) for p in paths],
+        [ParameterMessage(name=name, value=numbers) for name in names[:2]],
+        [ParameterMessage(name=name, value=nan) for name in names],
+    ):
+        for kind, name in (
+            (SetParameters, "set_parameters"),
+            (SetParametersAtomically, "set_parameters_atomically"),
+        ):
+            answer = attack.bench.call(kind, f"{NAME}/{name}", kind.Request(parameters=given), 30.0)
+            results = answer.results if kind is SetParameters else [answer.result]
+            assert results and all(not r.successful and r.reason for r in results), results
+            assert max(len(r.reason) for r in results) < 3000
+    attack.check()
+
+
+def test_services_in_any_order(attack: Attack) -> None:
+    """A hundred calls by someone who does not wait for the answers."""
+    rng = np.random.default_rng(3)
+    names = ("start", "pause", "resume")
+    pending = [attack.desk.clients[names[k]].call_async(Trigger.Request()) for k in rng.integers(0, 3, 100)]
+    for future in pending[-10:]:
+        assert attack.bench.future(future, 30.0).message
+    assert attack.desk.call("pause")[0] and attack.desk.call("resume")[0]
+    attack.stuck()
+    attack.check()
+
+
+def change(attack: Attack, *which: int) -> None:
+    for number in which:
+        request = ChangeState.Request(transition=Transition(id=number))
+        answer = attack.bench.call(ChangeState, f"{NAME}/change_state", request, 20.0, attempts=1)
+        assert answer.success
+
+
+def test_no_peer_chooses_where_is_written(attack: Attack) -> None:
+    """Not even one that takes the node out of service first; the campaign goes on when it is back."""
+    change(attack, Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+    given = [text_parameter(name, str(attack.outside)) for name in ("store_folder", "constraints_folder")]
+    answer = attack.bench.call(SetParameters, f"{NAME}/set_parameters", SetParameters.Request(parameters=given))
+    assert all(not r.successful and r.reason for r in answer.results)
+    change(attack, Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+    attack.bench.wait(lambda: attack.node._measuring._out.get_subscription_count())
+    attack.desk.until(S.PAUSED, measured=3)
+    assert attack.desk.call("resume")[0]
+    attack.stuck()
+    attack.check()
+
+
+# ── in the end ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_it_is_measured_to_its_end(attack: Attack) -> None:
+    attack.held = False
+    assert attack.desk.call("pause")[0] and attack.desk.call("resume")[0]
+    done = attack.desk.until(S.DONE, 60.0)
+    assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
+    names = {p.name.replace(done.campaign_id, "ID") for p in (attack.folder / "store").iterdir()}
+    assert names == {FILE, "measurements_ID.csv", "validation_ID.csv", "estimate_ID.yaml"}
+    assert [p.name for p in attack.outside.iterdir()] == ["secret.txt"]
+    read = GetParameters.Request(names=["store_folder"])
+    kept = attack.bench.call(GetParameters, f"{NAME}/get_parameters", read).values[0].string_value
+    assert kept == str(attack.folder / "store")
+
+
+# ── the robot, and what is in the folder ─────────────────────────────────────────────────────────────
+
+
+def test_a_robot_that_answers_nonsense(bench: Bench) -> None:
+    """A status that is none, a message of a million characters, feedback of no goal: a failure of the place."""
+    cell = bench.start(FakeCell)
+    cell.answer = lambda q: "nonsense" if q[0] > 0.5 else "ok"
+    desk = Desk(bench)
+    assert desk.call("start")[0]
+    done = desk.until(S.DONE, 60.0)
+    assert done.outcome == S.OUTCOME_REACHED and done.excluded >= 1
+    assert all(0 < len(e.reason) <= 500 for e in desk.node.campaign.exclusions)
+    assert all(len(m.reason) <= 1000 for m in desk.heard)
+
+
+HEAD = {"format": FORMAT, "campaign": "x", "robot": "planar_2r", "joint_names": ["q1", "q2"], "targets": 1}
+ROW = {"measured": 1, "role": "fit", "configuration": [0.1, 0.2], "points": [[1.0, 0.0, 0.0]]}
+JOURNALS: dict[str, list[Any]] = {
+    "numbers beyond all": [HEAD, ROW | {"measured": INF}],
+    "a role of its own": [HEAD, ROW | {"role": "../../escaped"}],
+    "joints": [HEAD, ROW | {"configuration": [0.1] * 10_000}],
+    "points": [HEAD, ROW | {"points": "../../escaped"}],
+    "other joints": [HEAD | {"joint_names": ["q1"] * 10_000}],
+    "nested": ["[" * 100_000],
+    "no journal": ["../../escaped"],
+    "a list": [[HEAD]],
+}
+
+
+@pytest.mark.parametrize("case", JOURNALS)
+def test_a_journal_that_is_none_is_left_alone(bench: Bench, tmp_path: Path, case: str) -> None:
+    lines = [x if isinstance(x, str) and x.startswith("[") else json.dumps(x) for x in JOURNALS[case]]
+    (tmp_path / FILE).write_text("\n".join(lines) + "\n")
+    before = (tmp_path / FILE).read_bytes()
+    desk = Desk(bench, store_folder=str(tmp_path))
+    assert desk.node.is_active and "cannot go on" in desk.now.reason and len(desk.now.reason) <= 1000
+    assert (tmp_path / FILE).read_bytes() == before
+
+
+def test_a_campaign_whose_name_leaves_the_folder_writes_nothing_there(bench: Bench, tmp_path: Path) -> None:
+    store = tmp_path / "a" / "store"
+    store.mkdir(parents=True)
+    (store / FILE).write_text(json.dumps(HEAD | {"campaign": "/../../../escaped"}) + "\n")
+    bench.start(FakeCell)
+    desk = Desk(bench, elsewhere=True)
+    desk.node = bench.start(CampaignNode, **(ASKED | {"store_folder": str(store)}))
+    bench.wait(lambda: desk.call("pause")[0])
+    assert desk.call("resume")[0]
+    assert "were not written" in desk.until(S.DONE, 60.0).reason
+    assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()] == [f"a/store/{FILE}"]
