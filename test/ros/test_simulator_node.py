@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,11 @@ from sensor_msgs.msg import JointState
 
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.instrument.standstill import NANO
+from calib_planner.ros import simulator_node
 from calib_planner.ros.conversions import nanoseconds, plan_to_message
 from calib_planner.ros.qos import SENSOR_IN
 from calib_planner.ros.simulator_node import SimulatorNode
+from calib_planner.simulation.motion import Tour, make_tour
 
 ACTION = "tracker_simulator/execute_plan"
 Result = ExecutePlan.Result
@@ -62,6 +65,31 @@ def test_it_visits_every_configuration(bench: Bench, planned: Plan) -> None:
         stamps = np.sort([nanoseconds(m.header.stamp) for m in heard]) / NANO
         assert np.isclose(np.median(np.diff(stamps)), period, atol=1e-6)
         assert np.isclose(np.diff(stamps), period, atol=1e-6).mean() > 0.9
+
+
+def test_a_short_motion_is_seen_however_long_it_takes_to_think_of_it(
+    bench: Bench, planned: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Backing off takes milliseconds here: begun before what was sampled already, nobody would see it."""
+
+    def slow(*args: Any) -> Tour:
+        time.sleep(0.2)
+        return make_tour(*args)
+
+    monkeypatch.setattr(simulator_node, "make_tour", slow)
+    states = bench.hear(JointState, "joint_states", SENSOR_IN)
+    bench.start(SimulatorNode, robot="planar_2r", joint_speed=12.0)
+    client = bench.action(ExecutePlan, ACTION)
+    one = {"configurations": planned.configurations[0].tolist(), "repetitions": [1]}
+
+    def off() -> np.ndarray:
+        return np.abs(np.array([s.position for s in states]) - planned.configurations[0]).max(axis=1)
+
+    bench.future(bench.goal(client, goal_of(planned, **one)).get_result_async(), 20.0)
+    bench.wait(lambda: states and (off()[-20:] < 1e-9).all())
+    count = len(states)
+    bench.future(bench.goal(client, goal_of(planned, **one)).get_result_async(), 20.0)
+    assert (off()[count:] > 1e-3).any()
 
 
 @pytest.mark.parametrize(
