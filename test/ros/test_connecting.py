@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import math
 import re
 import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,10 @@ import yaml
 from bench import Bench
 from calib_planner_msgs.action import ExecutePlan
 from geometry_msgs.msg import PointStamped
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 from robots import plan_of
 from sensor_msgs.msg import JointState
 
@@ -103,20 +106,76 @@ def test_the_driver_publishes_metres_and_stamps(bench: Bench, tmp_path: Path) ->
 # ── the robot ────────────────────────────────────────────────────────────────────────────────────────
 
 
+class FollowJointTrajectory:
+    """What the adapter uses of control_msgs, where that is not to be had."""
+
+    class Goal(SimpleNamespace):
+        """Fields as given."""
+
+    class Result(SimpleNamespace):
+        """Fields as given."""
+
+        SUCCESSFUL = 0
+        error_code, error_string = 0, ""
+
+
+class Arm:
+    """An action client's face, and behind it the controller's callback in a thread: no message, no server."""
+
+    controller: Controller
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.moved, self._cancelled = Future(), threading.Event()
+
+    def wait_for_server(self, timeout_sec: float) -> bool:
+        return timeout_sec > 0
+
+    def send_goal_async(self, goal: Any) -> Future:
+        sent, move = Future(), Arm()
+        move.request, move.accepted = goal, self.controller.refuse is False  # type: ignore[attr-defined]
+        sent.set_result(move)
+        if move.accepted:  # type: ignore[attr-defined]
+            threading.Thread(target=move.run, daemon=True).start()
+        return sent
+
+    def run(self) -> None:
+        self.moved.set_result(SimpleNamespace(result=self.controller._follow(self)))
+
+    def get_result_async(self) -> Future:
+        return self.moved
+
+    def cancel_goal_async(self) -> None:
+        self._cancelled.set()
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        return self._cancelled.is_set()
+
+    def succeed(self) -> None:
+        """Told by the result."""
+
+    abort = canceled = succeed
+
+
 class Controller(Node):
-    """A joint_trajectory_controller as far as the adapter sees one; it refuses and fails on demand."""
+    """A joint_trajectory_controller as far as the adapter sees one; it refuses, fails and hangs on demand."""
 
     def __init__(self, kind: Any, **options: Any) -> None:
         super().__init__("controller", **options)
         self.kind, self.q, self.visited, self.fail = kind, np.zeros(2), [], ""
+        self.refuse = self.hang = False
         self._publisher = self.create_publisher(JointState, "joint_states", 10)
         self.create_timer(0.01, self._publish)
+        if kind is FollowJointTrajectory:
+            Arm.controller = self
+            return
         self._server = ActionServer(
             self,
             kind,
             "joint_trajectory_controller/follow_joint_trajectory",
             self._follow,
             callback_group=ReentrantCallbackGroup(),
+            goal_callback=lambda _: GoalResponse.REJECT if self.refuse else GoalResponse.ACCEPT,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
@@ -135,6 +194,8 @@ class Controller(Node):
                 goal.canceled()
                 return self.kind.Result()
             self.q = start + x * (end - start)
+        while self.hang and not goal.is_cancel_requested:
+            threading.Event().wait(0.02)
         self.visited.append(end)
         if self.fail:
             goal.abort()
@@ -143,18 +204,44 @@ class Controller(Node):
         return self.kind.Result(error_code=0)
 
 
-def test_the_executor_drives_a_controller(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    control = pytest.importorskip("control_msgs.action", reason="control_msgs is not among the PyPI wheels")
-    adapter = module_of("plan_executor.py", tmp_path)
-    controller = Controller(control.FollowJointTrajectory, context=bench.context)
+@pytest.fixture(params=["control_msgs", "stand-in"])
+def executor(
+    bench: Bench, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Controller, Any, Any]:
+    """Controller, adapter and the adapter's module; with the real messages where they are installed."""
+    if request.param == "control_msgs":
+        kind = pytest.importorskip(
+            "control_msgs.action", reason="not among the PyPI wheels"
+        ).FollowJointTrajectory
+        adapter = module_of("plan_executor.py", tmp_path)
+    else:
+        kind = FollowJointTrajectory
+        stand_in(monkeypatch, kind)
+        adapter = module_of("plan_executor.py", tmp_path)
+        monkeypatch.setattr(adapter, "ActionClient", Arm)
+    controller = Controller(kind, context=bench.context)
     overrides = [("robot", "planar_2r"), ("joint_speed", 5.0), ("dwell", 0.2)]
     values = [adapter.rclpy.parameter.Parameter(k, value=v) for k, v in overrides]
     node = adapter.PlanExecutor(context=bench.context, parameter_overrides=values)
     for made in (controller, node):
         bench.nodes.append(made)
         bench._spin(made, 4)
-    client = bench.action(ExecutePlan, "plan_executor/execute_plan")
     bench.wait(lambda: node._here is not None)
+    return controller, node, adapter
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, kind: Any) -> None:
+    action = type(sys)("control_msgs.action")
+    action.FollowJointTrajectory = kind
+    monkeypatch.setitem(sys.modules, "control_msgs", type(sys)("control_msgs"))
+    monkeypatch.setitem(sys.modules, "control_msgs.action", action)
+
+
+def test_the_executor_drives_a_controller(
+    bench: Bench, executor: tuple[Controller, Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controller, _, adapter = executor
+    client = bench.action(ExecutePlan, "plan_executor/execute_plan")
     feedback: list[Any] = []
 
     def run(goal: ExecutePlan.Goal) -> Any:
@@ -167,16 +254,41 @@ def test_the_executor_drives_a_controller(bench: Bench, tmp_path: Path, monkeypa
     # Twice at each, and away in between.
     assert [bool(np.allclose(v, Q[0])) for v in controller.visited[:3]] == [True, False, True]
     assert {f.feedback.phase for f in feedback} == {"moving", "measuring"}
+    assert len(feedback) > 8, "signs of life within a phase"
     controller.fail = "path tolerance"
     result = run(goal)
     assert result.status == result.ABORTED and "path tolerance" in result.message
-    controller.fail = ""
+    controller.fail, controller.refuse = "", True
+    result = run(goal)
+    assert result.status == result.ABORTED and "refused configuration 0" in result.message
+    controller.refuse, controller.hang = False, True
+    with monkeypatch.context() as patch:
+        ticks = itertools.count(step=100.0)
+        patch.setattr(adapter, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
+        result = run(goal)
+    assert result.status == result.ABORTED and "no end of the move" in result.message
+    controller.hang = False
     goal.plan.robot = "another"
     assert run(goal).status == result.INVALID_PLAN
-    goal.plan.robot, goal.dwell = "planar_2r", 60.0
-    handle = bench.goal(client, goal)
+
+
+def test_the_executor_does_one_plan_at_a_time_and_can_be_stopped(
+    bench: Bench, executor: tuple[Controller, Any, Any]
+) -> None:
+    client = bench.action(ExecutePlan, "plan_executor/execute_plan")
+    goal = ExecutePlan.Goal(plan=plan_to_message(plan_of(ROBOT, Q, 2), "p", 0, "base"), dwell=60.0)
+    feedback: list[Any] = []
+    handle = bench.goal(client, goal, feedback_callback=feedback.append)
+    bench.wait(lambda: feedback and feedback[-1].feedback.phase == "measuring")
+    second = bench.future(bench.goal(client, goal).get_result_async()).result
+    assert second.status == second.BUSY and second.executed == 0
     bench.future(handle.cancel_goal_async())
-    assert bench.future(handle.get_result_async(), 10.0).result.status == result.CANCELLED
+    assert bench.future(handle.get_result_async(), 10.0).result.status == second.CANCELLED
+    controller = executor[0]
+    controller.hang = True
+    handle = bench.goal(client, goal)
+    bench.future(handle.cancel_goal_async())  # while it moves
+    assert bench.future(handle.get_result_async(), 10.0).result.status == second.CANCELLED
 
 
 def test_without_control_msgs_the_executor_still_imports_all_else(
@@ -184,8 +296,5 @@ def test_without_control_msgs_the_executor_still_imports_all_else(
 ) -> None:
     """Everything it takes from us and from rclpy exists."""
     if importlib.util.find_spec("control_msgs") is None:
-        action = type(sys)("control_msgs.action")
-        action.FollowJointTrajectory = object
-        monkeypatch.setitem(sys.modules, "control_msgs", type(sys)("control_msgs"))
-        monkeypatch.setitem(sys.modules, "control_msgs.action", action)
+        stand_in(monkeypatch, object)
     assert issubclass(module_of("plan_executor.py", tmp_path).PlanExecutor, Node)

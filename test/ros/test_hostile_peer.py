@@ -282,7 +282,7 @@ def test_descriptions(cell: Cell, case: str) -> None:
         for node in (PLANNER, IDENTIFIER)
     ]
     assert all("0123" not in words for words in said)
-    assert cell.identifier._campaign is before[1]
+    assert cell.identifier._campaign is before[1] and cell.planner._source.model is before[0]
     answer = cell.ask(robot="planar_2r")
     assert answer.status == PlanService.Response.SUCCESS
 
