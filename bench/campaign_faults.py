@@ -2,11 +2,14 @@
 
 What ``fault_matrix`` does in virtual time happens here as it does in a cell: three processes, their messages and
 stamps, DDS between them, a campaign that decides by itself where to measure and when to stop. This process starts
-it, listens and compares with the truth, which only the simulator knows. Good is PASS with every parameter within
-``WITHIN`` standard deviations of the truth, or WARN, FAIL or a pause with a reason. *Wrong* is PASS beyond that;
-*lost* is a standstill that was told accepted and is not in the identifier's store as it was told, or not in the
-campaign's results; a *crash* is a node that ended, wrote a traceback or could not be ended with status 0, and
-*hung* a campaign without an end. Each of them makes the exit status 1.
+it, listens and compares with the truth, which only the simulator knows. A campaign that pauses, with its reason,
+is *helped*: the fault is remedied (the simulator is started again without it) and the campaign resumed.
+
+Good is PASS with every parameter within ``WITHIN`` standard deviations of the truth, or WARN or FAIL with a reason.
+*Wrong* is PASS beyond that, or a pause that help does not end; *lost* is a standstill that was told accepted and is
+not in the identifier's store as it was told, or not in the campaign's results; a *crash* is a node that ended, wrote
+a traceback or could not be ended with status 0, and *hung* a campaign without an end. Each of them makes the exit
+status 1.
 
     python bench/campaign_faults.py                     # everything: some hours; runs sleep most of the time
     python bench/campaign_faults.py --faults reseat_0.3mm none --seeds 3 --jobs 3
@@ -57,8 +60,8 @@ EXPECTED = {"calibration_identifier", "tracker_simulator", NAME}
 MEASUREMENTS, SPAN = 16, 20.0
 """About what a campaign without faults takes; faults that begin do so half-way, the span is for drifts [s]."""
 HALF = MEASUREMENTS // 2
-ENDS = ("PASS", "WARN", "FAIL", "paused", "wrong", "lost", "crash", "hung")
-BAD = ENDS[4:]
+ENDS = ("PASS", "WARN", "FAIL", "wrong", "lost", "crash", "hung")
+BAD = ENDS[3:]
 S = CampaignStatus
 
 
@@ -107,7 +110,7 @@ def given(faults: Faults, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
         "starts": 8,
         "seed": seed,
         "patience": 3.0,
-        "longest_wait": 10.0,
+        "longest_wait": 20.0,
         "most_failures": 5,
     }
     stores = {"store_folder": f"'{folder / 'store'}'"}
@@ -127,6 +130,7 @@ class Run:
 
     Attributes:
         end: One of ``ENDS``.
+        helped: Why it paused; empty if it did not.
         worst, at_pose: Largest |error|/std of a parameter, whose; error at the test pose over the predicted one.
         told: Standstills by the status told last.
         why: Of a bad end.
@@ -135,6 +139,7 @@ class Run:
     fault: str
     seed: int
     end: str
+    helped: str = ""
     outcome: int = 0
     worst: float = float("nan")
     parameter: str = ""
@@ -161,22 +166,32 @@ class Desk(DemoClient):
         self.results: list[CalibrationEstimate] = []
         self._node.create_subscription(CampaignStatus, f"{NAME}/status", self.heard.append, LATCHED)
         self._node.create_subscription(CalibrationEstimate, f"{NAME}/estimate", self.results.append, LATCHED)
-        self._start = self._node.create_client(Trigger, f"{NAME}/start")
+        create = self._node.create_client
+        self._start, self._resume = (create(Trigger, f"{NAME}/{name}") for name in ("start", "resume"))
 
     def strangers(self) -> set[str]:
         """Nodes on the domain that are none of ours."""
         return set(self._node.get_node_names()) - EXPECTED - {self._node.get_name()}
 
-    def watch(self) -> None:
-        """Begin, and wait for the end."""
+    def begin(self) -> None:
+        """Start the campaign."""
         hears = (("joint_states", 1), ("calibration_identifier/measurements", 2))
         self.wait(lambda: all(self._node.count_subscribers(n) >= k for n, k in hears), 60.0, "graph")
         answer = self._call(self._start, Trigger.Request(), 30.0, "answer from start")
         if not answer.success and "not finished" not in answer.message:  # it may have been asked twice
             raise CalibPlannerError(f"start: {answer.message}")
+
+    def resume(self) -> None:
+        """Have it go on; it is heard of."""
+        self._call(self._resume, Trigger.Request(), 30.0, "answer from resume")
+        self.wait(lambda: self.heard[-1].state != S.PAUSED, 10.0, "going on")
+
+    def watch(self) -> CampaignStatus:
+        """Wait until it is done or pauses."""
         over = (S.DONE, S.PAUSED)
         self.wait(lambda: bool(self.heard) and self.heard[-1].state in over, LONGEST, "end of the campaign")
         self.wait(lambda: False, 1.0)  # what is still under way
+        return self.heard[-1]
 
 
 def run(fault: str, seed: int, domain: int, folder: Path) -> Run:
@@ -190,13 +205,20 @@ def run(fault: str, seed: int, domain: int, folder: Path) -> Run:
                 raise Disturbed
             for name in NODES:
                 nodes.start(name, parameters[name])
+            found = Run(fault, seed, "")
             try:
-                desk.watch()
-                found = Run(fault, seed, "")
+                desk.begin()
+                if (last := desk.watch()).state == S.PAUSED:
+                    found.helped = last.reason or "without a reason"
+                    if status := nodes.end_one("simulator_node"):
+                        raise CalibPlannerError(f"simulator_node ended with status {status}")
+                    nodes.start("simulator_node", given(Faults(), seed, folder)["simulator_node"])
+                    desk.resume()
+                    desk.watch()
             except CalibPlannerError as error:
                 alive = not str(error).startswith("no end")
-                last = desk.heard[-1].reason if desk.heard else "nothing heard"
-                found = Run(fault, seed, "crash" if alive else "hung", why=f"{error}; {last}"[:1500])
+                reason = desk.heard[-1].reason if desk.heard else "nothing heard"
+                found.end, found.why = "crash" if alive else "hung", f"{error}; {reason}"[:1500]
             if desk.strangers():
                 raise Disturbed
         finally:
@@ -207,10 +229,10 @@ def run(fault: str, seed: int, domain: int, folder: Path) -> Run:
     if not found.end:
         judge(found, desk, folder)
     bad = [f"{n} ended with status {s}" for n, s in statuses.items() if s]
-    for name in NODES:
-        text = (folder / "log" / f"{name}.log").read_text(errors="replace")
+    for log in sorted((folder / "log").glob("*.log")):
+        text = log.read_text(errors="replace")
         if "Traceback" in text:
-            bad.append(f"{name}: {text[text.index('Traceback') :][:1500]}")
+            bad.append(f"{log.name}: {text[text.index('Traceback') :][:1500]}")
     if bad:
         found.end, found.why = "crash", "; ".join([found.why, *bad])
     return found
@@ -236,12 +258,14 @@ def describe(found: Run, desk: Desk) -> None:
 def judge(found: Run, desk: Desk, folder: Path) -> None:
     """Verdict against truth, what was told against what was kept."""
     last = desk.heard[-1]
-    found.end = last.verdict if last.state == S.DONE else "paused"
+    found.end = last.verdict
+    if last.state != S.DONE:
+        found.end, found.why = "wrong", f"paused again: {last.reason}"
     if desk.results:
         compare(found, estimate_from_message(desk.results[-1]))
     if found.end == "PASS" and not found.worst <= WITHIN:
         found.end, found.why = "wrong", f"{found.parameter} is {found.worst:.1f} std off"
-    if not last.reason:
+    if not last.reason or found.helped == "without a reason":
         found.end, found.why = "wrong", f"{found.end} without a reason"
     missing = lost(desk, folder, last)
     if missing:
@@ -331,10 +355,11 @@ def runs(names: Sequence[str], seeds: Sequence[int], jobs: int, keep: Path | Non
 def table(done: dict[str, list[Run]]) -> None:
     """For people."""
     print(f"\n{'fault':<24}" + "".join(f"{e:>7}" for e in ENDS), end="", file=sys.stderr)
-    print("  worst of PASS  of WARN  at pose  seconds  measured  given up", file=sys.stderr)
+    print(" helped  worst of PASS  of WARN  at pose  seconds  measured  given up", file=sys.stderr)
     for name, found in ((n, f) for n, f in done.items() if f):
         ends = Counter(r.end for r in found)
         line = f"{name:<24}" + "".join(f"{ends.get(e, 0):>7}" for e in ENDS)
+        line += f"{sum(bool(r.helped) for r in found):7}    "
         for level in ("PASS", "WARN"):
             line += f"{max((r.worst for r in found if r.end == level), default=float('nan')):11.1f}"
         line += f"{max((r.at_pose for r in found if r.end == 'PASS'), default=float('nan')):12.1f}"

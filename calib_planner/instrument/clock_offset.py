@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 from statistics import median
 
 NANO = 1_000_000_000
-REMEMBERED = 9
-"""Standstills that an offset is the median of."""
+REMEMBERED = 5
+"""Standstills that an offset is the median of; more would be longer in noticing that a clock was set."""
 FEWEST = 3
 """Standstills without which there is no offset."""
 

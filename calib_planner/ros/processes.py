@@ -85,6 +85,15 @@ class Nodes:
             )
         self._children.append(_Child(module, process, log))
 
+    def end_one(self, module: str, number: signal.Signals = signal.SIGINT) -> int:
+        """End a node that may be started again, with another log; returns its exit status."""
+        child = next(c for c in self._children if c.name == module)
+        with _undisturbed():
+            status = self._end(number, [child])[module]
+        self._children.remove(child)
+        child.log.rename(child.log.with_suffix(f".{child.process.pid}.log"))
+        return status
+
     @property
     def processes(self) -> dict[str, int]:
         """Process id of each node."""
@@ -100,10 +109,10 @@ class Nodes:
     def end(self, number: signal.Signals = signal.SIGINT) -> dict[str, int]:
         """End all nodes; returns the exit status of each (negative: had to be killed)."""
         with _undisturbed():
-            return self._end(number)
+            return self._end(number, self._children)
 
-    def _end(self, number: signal.Signals) -> dict[str, int]:
-        running = [c for c in self._children if c.process.poll() is None]
+    def _end(self, number: signal.Signals, children: Sequence[_Child]) -> dict[str, int]:
+        running = [c for c in children if c.process.poll() is None]
         for child in running:
             child.process.send_signal(number)
         deadline = time.monotonic() + PATIENCE
@@ -113,10 +122,10 @@ class Nodes:
             except subprocess.TimeoutExpired:
                 child.process.kill()
                 child.process.wait()
-        for child in self._children:
+        for child in children:
             if child.process.stdin is not None:
                 child.process.stdin.close()
-        return {c.name: int(c.process.returncode) for c in self._children}
+        return {c.name: int(c.process.returncode) for c in children}
 
     def logs(self) -> dict[str, str]:
         """The last lines of each node's output."""

@@ -82,7 +82,7 @@ def test_synchronised_again_it_recovers() -> None:
         clocks.add_point(0, 4 * k * NANO + shift, (4 * k + 1) * NANO + shift)
         clocks.add_joints(4 * k * NANO, (4 * k + 1) * NANO)
         found = clocks.offset(0)
-        assert found is None or found.exceeds(0.1) == (k < 14)
+        assert found is None or found.exceeds(0.1) == (k < 12)
 
 
 def test_rests_that_had_the_offset_are_named_and_no_others() -> None:
@@ -94,8 +94,8 @@ def test_rests_that_had_the_offset_are_named_and_no_others() -> None:
         clocks.add_joints(*rest)
         found = clocks.offset(0)
         noticed = found is not None and found.exceeds(0.1)
-        assert noticed == (k >= 7)
-        assert clocks.beyond(0, 0.1) == (rests[4 : k + 1] if noticed else [])
+        assert noticed == (k >= 6)
+        assert clocks.beyond(0, 0.1) == (rests[max(4, k - 4) : k + 1] if noticed else [])
 
 
 def test_a_doubtful_rest_is_not_named() -> None:

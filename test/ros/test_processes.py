@@ -79,6 +79,19 @@ def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -
         assert "Traceback" not in log.read_text(), log.read_text()
 
 
+def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
+    with Nodes(tmp_path, next_domain()) as nodes:
+        log = tmp_path / "simulator_node.log"
+        for _ in range(2):
+            nodes.start("simulator_node")
+            assert wait(lambda: log.stat().st_size)
+            pid = nodes.processes["simulator_node"]
+            nodes.check()
+            assert nodes.end_one("simulator_node") == 0 and not running(pid)
+            assert not log.exists() and log.with_suffix(f".{pid}.log").stat().st_size
+        assert nodes.processes == {} == nodes.end()
+
+
 def test_a_module_that_is_none_is_refused() -> None:
     command = [sys.executable, "-m", "calib_planner.ros.child", "../planner_node"]
     ended = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
