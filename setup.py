@@ -39,6 +39,7 @@ setup(
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
         "docs": ["sphinx>=8.1", "myst-parser>=4", "furo"],
         "bags": ["rosbags"],
+        "threads": ["threadpoolctl>=3.1"],
         "collision": ["pin"],
         "distributed": ["dask[distributed]"],
     },

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner._arrays import FloatArray
+from calib_planner._threads import one_thread
 from calib_planner.design.bound import RelaxedDesign, RelaxedProblem, relaxed_design
 from calib_planner.design.criteria import (
     Compound,
@@ -63,6 +64,7 @@ class Progress:
 Callback = Callable[[Progress], bool | None]
 
 
+@one_thread
 def plan(
     problem: PlanProblem,
     callback: Callback | None = None,

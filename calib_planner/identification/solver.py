@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_planner._arrays import FloatArray
+from calib_planner._threads import one_thread
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.evidence import Evidence, estimate_of
@@ -54,6 +55,7 @@ START_ANGLE = 2e-2
 """The same for angles [rad]."""
 
 
+@one_thread
 def identify(problem: IdentificationProblem, start: Estimate | None = None) -> Estimate:
     """Identify the active parameters.
 

@@ -28,6 +28,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from calib_planner._arrays import FloatArray, check_count
+from calib_planner._threads import one_thread
 from calib_planner.errors import InputError, NotEnoughDataError
 from calib_planner.identification.discrepancy import Discrepancy, fit_discrepancy
 from calib_planner.identification.equations import configuration_labels
@@ -44,6 +45,7 @@ from calib_planner.robot.chain import Robot
 INSIDE = float(np.sqrt(chi2.ppf(0.95, 3)))
 
 
+@one_thread
 def validate(
     problem: IdentificationProblem,
     estimate: Estimate,
@@ -81,6 +83,7 @@ def validate(
     return replace(estimate, validation=_statistics(found))
 
 
+@one_thread
 def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: int = 5, seed: int = 0) -> Estimate:
     """``estimate`` with the distances of configurations that were left out in turn.
 
