@@ -17,6 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -97,11 +98,13 @@ class CampaignStore:
     def __init__(self, path: Path | None, database: sqlite3.Connection, model: StoredModel) -> None:
         self.path, self.model, self._database = path, model, database
         self._file = None if path is None else identity(path)
+        self._turn = threading.RLock()  # SQLite crashes if it is closed while another thread reads
         self.trouble = ""
 
     def close(self) -> None:
         """Let the file go; what was committed is there already."""
-        self._database.close()
+        with self._turn:
+            self._database.close()
 
     # ── what there is ────────────────────────────────────────────────────────────────────────────────
 
@@ -220,7 +223,8 @@ class CampaignStore:
 
     def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
         try:
-            return self._database.execute(sql, values).fetchall()
+            with self._turn:
+                return self._database.execute(sql, values).fetchall()
         except sqlite3.Error as error:
             raise StoreError(self.path, str(error), "check the disk") from None
 
@@ -230,6 +234,10 @@ class CampaignStore:
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """One transaction: committed to disk, or as if it had never been."""
+        with self._turn:
+            yield from self._transaction()
+
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
         try:
             if self.path is not None and identity(self.path) != self._file:
                 raise StoreError(self.path, "the file was moved, removed or replaced", "put it back")
@@ -248,11 +256,11 @@ class CampaignStore:
 
     def _roll_back(self) -> None:
         # SQLite may have rolled back itself; a roll-back that fails is made up for by the next BEGIN.
-        if self._database.in_transaction:
-            try:
+        try:
+            if self._database.in_transaction:
                 self._database.execute("ROLLBACK")
-            except sqlite3.Error:
-                return
+        except sqlite3.Error:
+            return
 
 
 class UnavailableStore(CampaignStore):

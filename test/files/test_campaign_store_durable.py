@@ -7,6 +7,8 @@ import random
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -160,3 +162,25 @@ def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
     assert found is not None
     for d in found.decisions:
         assert_same(d, replace(decision(standstill(d.number)), number=d.number, status=d.status))
+
+
+def test_a_store_that_is_closed_while_others_use_it_refuses_them(tmp_path: Path) -> None:
+    store, met = opened(tmp_path), []
+    number = begun(store)
+
+    def use(read: bool) -> None:
+        for seed in range(10**6):
+            try:
+                _ = store.empty if read else store.record(number, decision(standstill(seed)))
+            except StoreError as error:
+                met.append(error)
+                return
+
+    threads = [threading.Thread(target=use, args=(k % 2 == 0,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    time.sleep(0.05)
+    store.close()
+    for thread in threads:
+        thread.join(20.0)
+    assert len(met) == 4
