@@ -7,9 +7,9 @@ is *helped*: the fault is remedied (the simulator is started again without it) a
 
 Good is PASS with every parameter within ``WITHIN`` standard deviations of the truth, or WARN or FAIL with a
 reason. *Wrong* is PASS beyond that, or a pause that help does not end; *lost* is a standstill that was told
-accepted and is not in the identifier's store as it was told, or not in the campaign's results; a *crash* is a node
-that ended, wrote a traceback or could not be ended with status 0, and *hung* a campaign without an end. Each of
-them makes the exit status 1.
+accepted and is not in the identifier's store as it was told, or not in the campaign's results; a *crash* is a
+node that ended, wrote a traceback or could not be ended with status 0, and *hung* a campaign without an end. Each
+of them makes the exit status 1.
 
     python bench/campaign_faults.py                     # everything: some hours; runs sleep most of the time
     python bench/campaign_faults.py --faults reseat_0.3mm none --seeds 3 --jobs 3

@@ -132,7 +132,8 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
     def _keep_frame(self) -> None:
         """Points are to come in the frame of those that are kept; if there are none, in any."""
         if self._intake is not None:
-            self._intake.frame = "" if self._campaign is None else self._campaign.frame
+            frame = "" if self._campaign is None else self._campaign.frame
+            self._intake.frame, self._intake.bound = frame, bool(frame)
 
     def _leave_campaign(self) -> None:
         if self._campaign is not None:
@@ -235,6 +236,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             decision = campaign.take(found, self._how, intake.frame, ("clock_offset", text) if text else None)
             self._output.decision(campaign, decision)
             if decision.status == ACCEPTED:
+                intake.bound = bool(intake.frame)
                 self._update()
         self._withdraw_misdated()
 

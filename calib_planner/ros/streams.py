@@ -18,6 +18,7 @@ from calib_planner.errors import InputError
 from calib_planner.files.campaign_records import LONGEST
 from calib_planner.instrument.joint_state import pick_joints
 from calib_planner.instrument.standstill import (
+    IN_A_ROW,
     NANO,
     Reason,
     Rejection,
@@ -112,6 +113,8 @@ class Intake:
 
     Attributes:
         frame: Points of other frames are refused; empty: the next frame named. Points that name none are taken.
+        bound: Whether that frame has to stay, since points in it are kept. Else another one takes its place when
+            ``IN_A_ROW`` points in a row, of all targets, are in it.
     """
 
     def __init__(
@@ -122,13 +125,13 @@ class Intake:
         settings: StandstillSettings,
     ) -> None:
         self.watches = [StreamWatch(name) for name in (joint_topic, *topics)]
-        self.frame = ""
+        self.frame, self.bound, self._strange = "", False, 0
         self._settings = settings
         self.use(joint_names)
 
     def use(self, joint_names: Sequence[str] | None) -> None:
         """Begin anew for a robot with these joints."""
-        names = joint_names or ()
+        names = self._names = tuple(joint_names or ())
         self._reader = JointReader(names)
         targets = len(self.watches) - 1
         self._other_frame = [""] * targets
@@ -160,12 +163,17 @@ class Intake:
             self._other_frame[target] = f"{other}: publish all in one frame, or call ~/reset"
             watch.refuse(self._other_frame[target])
             return []
-        self._other_frame[target] = ""
+        self._other_frame[target], self._strange = "", 0
         p = message.point
         return self._explained(self.detector.add_point(target, stamp, np.array((p.x, p.y, p.z))))
 
     def _enter_frame(self, frame: str) -> bool:
-        self.frame = self.frame or frame
+        self._strange += 1
+        if not self.frame:
+            self.frame = frame
+        elif not self.bound and self._strange >= IN_A_ROW:
+            self.use(self._names)  # no mean of both
+            self.frame = frame
         return self.frame == frame
 
     def _explained(self, results: list[Standstill | Rejection]) -> list[Standstill | Rejection]:

@@ -93,6 +93,18 @@ def test_points_in_another_frame_are_refused_with_the_reason(
     assert shift.rest(planned.configurations[0]).header.frame_id == "elsewhere"
 
 
+def test_as_long_as_nothing_is_kept_another_frame_may_come(bench: Bench, robot: Robot, planned: Plan) -> None:
+    shift = Shift(bench, robot)
+    shift.frame = "stray"
+    shift.rest(planned.configurations[0] + 0.2)  # before there was a plan
+    shift.announce(planned)
+    shift.frame = "laser"
+    found = shift.rest(planned.configurations[0], 3.2)
+    assert (found.status, found.header.frame_id) == (Measurement.ACCEPTED, "laser")
+    shift.frame = "stray"
+    assert shift.rest(planned.configurations[1], 3.2).status == FRAME
+
+
 def test_a_frame_that_changes_within_a_standstill_is_not_averaged(
     bench: Bench, robot: Robot, planned: Plan
 ) -> None:
