@@ -17,6 +17,11 @@ residuals are whitened by what the points of one configuration share. The scan
 over k and the kinds counts as so many questions (Bonferroni). Since r ⟂ Q, S is bᵀ G⁺ b with b = Cᵀr and
 G = CᵀC − (QᵀC)ᵀ(QᵀC), sums over rows: going back from the last row, every k costs one row.
 
+What a disturbance does to the residuals may pass for a *discrepancy*, and residuals whitened by that hardly know
+of it any more. So where there is one they are asked again, whitened by measurement noise alone. If the answer is
+no chance, and noise explains what the disturbance leaves, ‖r‖² − S being a probable χ², then it explains them no
+worse than a discrepancy, and only measuring again tells which. What no geometry describes errs everywhere.
+
 What the parameters would move if the disturbance were part of the model, in standard deviations, says what it
 does to the calibration. A test of order is blind where order and posture are one: if the configurations were
 visited along a path, what the model lacks there looks like a drift. Shuffling the visits tells them apart.
@@ -30,11 +35,12 @@ from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc
 from scipy.stats import f as fisher_f
 
 from calib_planner._arrays import FloatArray, IntArray, check_array, frozen
 from calib_planner.identification.equations import Equations
-from calib_planner.identification.noise_levels import DiscrepancyModel, NoiseLevels
+from calib_planner.identification.noise_levels import DiscrepancyModel, NoiseLevels, improbable
 from calib_planner.robot.chain import Robot
 
 SIGNIFICANT = 1e-3
@@ -57,15 +63,20 @@ class Disturbance:
     """What may have happened, and how probable residuals as these are if it did not.
 
     Attributes:
-        kind: ``drift``, ``bump`` or ``reseat``.
-        row: First row measured afterwards, from 0, in the order of the data; ``None`` for a drift.
+        kind: ``drift``, ``bump``, ``reseat``, or ``distance`` (see ``distance_check``).
+        row: First row measured afterwards, from 0, in the order of the data; ``None`` for a drift and distances.
         target: The target, from 1; ``None`` for the station.
         probability: Of as clear a sign by chance, all rows and kinds tried being counted.
         translation: (3,) of the station at the points' centre, from the first row to the last (drift) or at the
-            row (bump), in the tracker's frame; of the target in the tip's frame [m].
+            row (bump), in the tracker's frame; of the target in the tip's frame; root mean square along the line
+            of sight, 0, 0 (distance) [m].
         rotation: (3,) of the station in the same sense [rad]; zero for a target.
         shift: Largest change of a parameter, in its standard deviations, if this were part of the model.
         parameter: The parameter that changes so much.
+        left: Sum of squares of the whitened residuals with this in the model.
+        freedom: Its degrees of freedom.
+        instead: Whether measurement noise explains what is left, so that no discrepancy is needed beside this;
+            ``probability`` is then by measurement noise alone.
     """
 
     kind: str
@@ -76,6 +87,9 @@ class Disturbance:
     rotation: FloatArray
     shift: float
     parameter: str
+    left: float = float("nan")
+    freedom: int = 0
+    instead: bool = False
 
     @property
     def certain(self) -> bool:
@@ -121,6 +135,19 @@ def check_order(
     # The kinds are asked together: as many questions more.
     counted = [replace(d, probability=min(1.0, d.probability * len(found))) for d in found]
     return tuple(sorted(counted, key=lambda d: d.probability))
+
+
+def instead_of_discrepancy(asked: Iterable[Disturbance], repeats: int) -> Disturbance | None:
+    """The disturbance that explains best what a discrepancy stands for, if one does and matters.
+
+    Args:
+        asked: Answers of residuals whitened by measurement noise alone.
+        repeats: Degrees of freedom of the repetitions that told the noise level; 0: it is known.
+    """
+    enough = [d for d in asked if d.certain and d.matters and not improbable(d.left, d.freedom, repeats)]
+    if not enough:
+        return None
+    return replace(max(enough, key=lambda d: float(chdtrc(d.freedom, d.left))), instead=True)
 
 
 def wholly_whitened(
@@ -292,6 +319,7 @@ class _Fit:
         square, absorbed, along = white.T @ white, self.basis.T @ white, white.T @ self.residuals
         explained, rank = _explained((square - absorbed.T @ absorbed)[None], square[None], along[None])
         probability = float(self._probability(explained, rank)[0])
+        left = float(self.residuals @ self.residuals) - float(explained[0])
         if not np.isfinite(probability):
             return None
         scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
@@ -308,6 +336,8 @@ class _Fit:
             rotation=frozen(amounts[3:] if len(amounts) > 3 else np.zeros(3)),
             shift=float(moved[k]),
             parameter=self.equations.robot.parameter_names[self.kept[k]],
+            left=max(left, 0.0),
+            freedom=len(self.residuals) - len(self.kept) - int(rank[0]),
         )
 
     def _probability(self, explained: FloatArray, rank: IntArray) -> FloatArray:

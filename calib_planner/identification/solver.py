@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from calib_planner._arrays import FloatArray
 from calib_planner._threads import one_thread
 from calib_planner.errors import NotEnoughDataError
+from calib_planner.identification.distance_check import check_distances
 from calib_planner.identification.estimate import Estimate
 from calib_planner.identification.evidence import Evidence, estimate_of
 from calib_planner.identification.hidden_errors import HiddenErrors, hidden_errors
@@ -29,6 +30,7 @@ from calib_planner.identification.noise_levels import improbable
 from calib_planner.identification.order_check import (
     Disturbance,
     check_order,
+    instead_of_discrepancy,
     rejected_since,
     wholly_whitened,
 )
@@ -268,5 +270,13 @@ def _disturbances(work: Work, found: Weighed) -> tuple[Disturbance, ...]:
     if work.problem.order_check == "off" or not found.fit.converged:
         return ()
     white = wholly_whitened(found.equations, work.instrument, found.levels, work.labels)
-    asked = check_order(white, found.fit.deviations, found.fit.kept, found.covariance)
+    fitted, levels = (found.fit.deviations, found.fit.kept, found.covariance), found.levels
+    asked = check_order(white, *fitted)
+    if levels.discrepancy > 0 and levels.source != "residuals" and not any(d.matters for d in asked):
+        noisy = work.equations(found.equations.use, _instrument(work, found))
+        repeats = levels.repeat_freedom if levels.source == "repetitions" else 0
+        distances = check_distances(noisy, *fitted)
+        others = (*check_order(noisy, *fitted), *(() if distances is None else (distances,)))
+        other = instead_of_discrepancy(others, repeats)
+        asked = () if other is None else (other,)
     return tuple(d for d in asked if d.matters)

@@ -152,14 +152,21 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
 
 
 def _order(e: Estimate) -> Iterator[Reason]:
-    words = {"drift": "the tracker drifted", "bump": "the tracker was moved", "reseat": "was seated elsewhere"}
+    words = {
+        "drift": "the tracker drifted",
+        "bump": "the tracker was moved",
+        "reseat": "was seated elsewhere",
+        "distance": "the tracker's distances err",
+    }
     for found in e.disturbances:
-        level = "FAIL" if found.certain and found.shift > HARMFUL else "WARN"
+        sure = found.certain and not found.instead
+        level = "FAIL" if sure and found.shift > HARMFUL else "WARN"
         who = f"target {found.target} " if found.target else ""
         when = "" if found.row is None else f" before row {found.row}"
         far = float(np.linalg.norm(found.translation))
+        sign = f"by chance {found.probability:.1g}" if not found.instead else "noise explains the rest"
         text = (
-            f"{who}{words[found.kind]}{when}, it seems, by {mm(far)} (by chance {found.probability:.1g}); "
+            f"{who}{words[found.kind]}{when}, it seems, by {mm(far)} ({sign}); "
             f"{found.parameter} may be off by {found.shift:.2g} standard deviations"
         )
         yield Reason(

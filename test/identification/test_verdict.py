@@ -88,6 +88,12 @@ def reseated():
     return solved(bare(data, points), asked, starts=0)
 
 
+def distances():
+    """Of a tracker at the base, each wrong by a number of its own."""
+    data, off = data_of(count=40), 2e-4 * np.random.default_rng(1).standard_normal((40, 1, 1))
+    return solved(bare(data, data.p + off * data.p / np.linalg.norm(data.p, axis=2, keepdims=True)))
+
+
 def moved_for_good():
     data = data_of(count=40)
     points = np.array(data.p)
@@ -155,6 +161,7 @@ PROVOKED = {
     "drift": [("WARN", lambda: stood_elsewhere(np.linspace([0, 0, 0], [1e-4, 1e-4, 0], 40)))],
     "bump": [("WARN", bumped), ("FAIL", lambda: bumped(discrepancy="off"))],
     "reseat": [("FAIL", reseated)],
+    "distance": [("WARN", distances)],
     "moved": [("WARN", moved_for_good)],
     "joint_corrections": [("PASS", wrong)],
     "residual_structure": [("WARN", joint_bend), ("PASS", wrong)],
@@ -188,7 +195,12 @@ USUAL = {"not_validated", "predicted_and_achieved", "correlated", "nearly_depend
 def test_the_table_is_complete():
     """Every code that the module can say is provoked below."""
     source = Path(module.__file__).read_text()
-    said = set(re.findall(r'Reason\(\s*(?:"\w+"|level),\s*"(\w+)"', source)) | {"drift", "bump", "reseat"}
+    said = set(re.findall(r'Reason\(\s*(?:"\w+"|level),\s*"(\w+)"', source)) | {
+        "drift",
+        "bump",
+        "reseat",
+        "distance",
+    }
     assert said == set(PROVOKED)
 
 
