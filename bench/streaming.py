@@ -2,15 +2,17 @@
 
     python bench/streaming.py [--updates 9] [--counts 10 20 50 100 200 400]
 
-A simulated KR-270 (0.5 mm, 1 mrad, 0.03 mm of noise), one target. ``full``: all 36 placement errors;
-``full, base, tool``: the tracker's pose and the target unknown besides; ``paper``: lengths and joint offsets
-only, so that the other errors are a discrepancy, which is estimated as on a real robot. An update takes an
-accumulator of n − 1 configurations, whose estimate is there, adds one and asks for everything of the new
-estimate, verdict included; medians over ``--updates`` of them with different configurations. ``cpu_ms`` is the
-processor's time: what the clock shows on a core of one's own. ``undo_ms`` withdraws a configuration from the
-middle instead. ``deviation`` is the largest absolute difference of any value, standard deviation [m | rad] or
-residual [m] from ``identify`` of the same measurements without a start. Robust data have a gross error in every
-tenth point. ``load`` is the machine's when the row was done.
+A simulated KR-270 (0.5 mm, 1 mrad, 0.03 mm of noise), one target. ``full``: all 36 placement errors; ``full,
+base, tool``: the tracker's pose and the target unknown besides; ``paper``: lengths and joint offsets only, so
+that the other errors are a discrepancy, which is estimated as on a real robot. An update takes an accumulator of
+n − 1 configurations, whose estimate is there, adds one and asks for everything of the new estimate, verdict
+included; medians over ``--updates`` of them with different configurations. ``cpu_ms`` is the processor's time,
+``least_ms`` the least of it: what the clock shows on an idle core. ``undo_ms`` withdraws a configuration from
+the middle instead. On any machine: ``jacobians`` is ``least_ms`` over that of one ``positions_and_jacobian`` of
+these configurations, ``whole`` the processor's time of all that ``identify`` does by default over ``cpu_ms``.
+``deviation`` is the largest absolute difference of any value, standard deviation [m | rad] or residual [m] from
+``identify`` of the same measurements without a start. Robust data have a gross error in every tenth point.
+``load`` is the machine's when the row was done.
 """
 
 from __future__ import annotations
@@ -58,11 +60,18 @@ def simulate(count: int, loss: str) -> tuple[Robot, Measurements]:
 
 def timed(job: Callable[[], Accumulator]) -> tuple[Estimate, float, float]:
     """The estimate, verdict included, and milliseconds by the clock and of the processor."""
-    clock, processor = time.perf_counter(), time.process_time()
+    clock, used = time.perf_counter(), time.process_time()
     estimate = job().estimate
     assert estimate is not None
     _ = estimate.verdict
-    return estimate, 1e3 * (time.perf_counter() - clock), 1e3 * (time.process_time() - processor)
+    return estimate, 1e3 * (time.perf_counter() - clock), 1e3 * (time.process_time() - used)
+
+
+def processor(job: Callable[[], object]) -> float:
+    """Milliseconds of the processor."""
+    began = time.process_time()
+    job()
+    return 1e3 * (time.process_time() - began)
 
 
 def deviation(one: Estimate, other: Estimate) -> float:
@@ -80,18 +89,26 @@ def measure(robot: Robot, data: Measurements, count: int, loss: str, updates: in
     before = begin.with_measurements(data.select(np.arange(count - 1)))
     _ = before.estimate
     rows: list[tuple[float, float]] = []
+    problem = before.problem
+    jacobian = min(processor(lambda: robot.positions_and_jacobian(problem.data.q)) for _ in range(20))
     undone, apart = [], []
     for k in range(count - 1, count - 1 + updates):
         after = before.with_configuration(data.q[k], data.p[k])
-        estimate, clock, processor = timed(lambda after=after: after)
-        rows.append((clock, processor))
+        estimate, *times = timed(lambda after=after: after)
+        rows.append((times[0], times[1]))
         undone.append(timed(lambda after=after: after.without(after.ids[count // 2]))[1])
         if len(apart) < 3:
             apart.append(deviation(estimate, identify(after.problem)))
+    asked = {"starts": 2, "joint_corrections": "auto", "order_check": "auto"}
+    whole = processor(lambda: identify(replace(problem, **asked)).verdict)
+    least, usual = min(r[1] for r in rows), median(r[1] for r in rows)
     return {
         "configurations": count,
         "clock_ms": median(r[0] for r in rows),
-        "cpu_ms": median(r[1] for r in rows),
+        "cpu_ms": usual,
+        "least_ms": least,
+        "jacobians": least / jacobian,
+        "whole": whole / usual,
         "undo_ms": median(undone),
         "deviation": max(apart),
     }
@@ -103,8 +120,8 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 20, 50, 100, 200, 400])
     args = parser.parse_args()
     result = []
-    head = f"{'parameters':>18} {'P':>3} {'loss':>7} {'n':>4} {'clock ms':>9} {'cpu ms':>7} {'undo ms':>8}"
-    print(head, " deviation", file=sys.stderr)
+    head = f"{'parameters':>18} {'P':>3} {'loss':>7} {'n':>4} {'clock ms':>9} {'cpu ms':>7} {'least':>6} "
+    print(head + f"{'undo ms':>8} {'jacobians':>9} {'whole':>6}  deviation", file=sys.stderr)
     for loss in ("linear", "robust"):
         shared, data = simulate(max(args.counts) + args.updates, loss)
         for name, (level, unknown) in CASES.items():
@@ -116,7 +133,8 @@ def main() -> None:
                 load = os.getloadavg()[0]
                 result.append({"case": name, "parameters": size, "loss": loss, **row, "load": load})
                 numbers = (
-                    f"{row['clock_ms']:9.1f} {row['cpu_ms']:7.1f} {row['undo_ms']:8.1f}  {row['deviation']:.0e}"
+                    f"{row['clock_ms']:9.1f} {row['cpu_ms']:7.1f} {row['least_ms']:6.1f} {row['undo_ms']:8.1f} "
+                    f"{row['jacobians']:9.1f} {row['whole']:6.1f}  {row['deviation']:.0e}"
                 )
                 print(f"{name:>18} {size:>3} {loss:>7} {count:>4} {numbers}", file=sys.stderr, flush=True)
     print(json.dumps(result))

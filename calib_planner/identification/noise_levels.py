@@ -19,6 +19,7 @@ the last two terms being what r owes to having been fitted. θ follows by Fisher
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,14 +153,19 @@ class DiscrepancyModel:
         together = np.hstack([np.sqrt(v) * c for v, c in zip(variances, self.columns, strict=True)])
         return block_whitening(self.blocks, self.instrument, together)
 
-    def sums_of_squares(self, columns: FloatArray, rows: FloatArray) -> float:
-        """‖Ũᵀ X‖² within blocks, for whitened columns and whitened rows X (equations, m)."""
-        return float(sum(np.sum((np.swapaxes(columns[i], 1, 2) @ rows[i]) ** 2) for i in self.blocks))
+    @cached_property
+    def per_variance(self) -> FloatArray:
+        """(parts,) mean variance of a coordinate [m²] for θ = 1."""
+        return np.array([np.mean(np.sum(c**2, axis=1)) for c in self.columns])
+
+    @cached_property
+    def membership(self) -> FloatArray:
+        """(parts, all columns) 1 where a column is one of a part's."""
+        return np.repeat(np.eye(len(self.columns)), [c.shape[1] for c in self.columns], axis=1)
 
     def mean_square(self, variances: FloatArray) -> float:
         """Mean variance of a coordinate [m²]."""
-        parts = [v * np.mean(np.sum(c**2, axis=1)) for v, c in zip(variances, self.columns, strict=True)]
-        return float(sum(parts))
+        return float(variances @ self.per_variance)
 
 
 def improbable(cost: float, freedom: int, repeats: int = 0) -> bool:
@@ -182,6 +188,7 @@ def estimate_variances(
     residuals: FloatArray,
     jacobian: FloatArray,
     prior: tuple[FloatArray, FloatArray],
+    start: FloatArray | None = None,
     rounds: int = 60,
 ) -> FloatArray:
     """θ by restricted maximum likelihood.
@@ -191,6 +198,7 @@ def estimate_variances(
         residuals: (equations,) measured − predicted [m], not whitened.
         jacobian: (equations, P) of the parameters solved for, not whitened.
         prior: (K, P) whitened rows and (K,) right-hand sides; K may be 0.
+        start: (parts,) variances to begin from, such as those of nearly the same points.
 
     Returns:
         (parts,) variances, zero where negligible.
@@ -198,7 +206,9 @@ def estimate_variances(
     count = len(model.columns)
     noise = float(np.mean(np.einsum("kii->k", model.instrument))) / 3.0
     excess = max(float(np.mean(residuals**2)) - noise, 0.01 * noise)
-    variances = np.array([excess / count / np.mean(np.sum(c**2, axis=1)) for c in model.columns])
+    variances = excess / count / model.per_variance
+    if start is not None:
+        variances = np.where(start > 0.0, start, NEGLIGIBLE * variances)
     for _ in range(rounds):
         score, fisher = _score(model, residuals, jacobian, prior, variances)
         # Unknowns θ_k/θ_k,old: no part can leave its scale in one step, nor become negative.
@@ -206,7 +216,7 @@ def estimate_variances(
         step = np.linalg.solve(scaled + 1e-9 * np.trace(scaled) * np.eye(count), score * variances)
         factor = np.clip(1.0 + step, 0.2, 5.0)
         variances = variances * factor
-        share = variances * [np.mean(np.sum(c**2, axis=1)) for c in model.columns]
+        share = variances * model.per_variance
         gone = share < 0.1 * NEGLIGIBLE * (share.sum() + noise)
         if (np.abs(factor - 1.0)[~gone] < 1e-3).all():
             break
@@ -222,22 +232,19 @@ def _score(
 ) -> tuple[FloatArray, FloatArray]:
     """∂(restricted log likelihood)/∂θ and its approximate Fisher information."""
     whitening = model.whitening(variances)
-    white = [whitening.apply(c) for c in model.columns]
+    white = whitening.apply(np.hstack(model.columns))
     rows = np.vstack([whitening.apply(jacobian), prior[0]])
     basis = np.linalg.qr(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))[0]
     right = np.append(whitening.apply(residuals), prior[1])
     right = right - basis @ (basis.T @ right)
     n = len(residuals)
-    score = np.array(
-        [
-            0.5
-            * (
-                model.sums_of_squares(w, right[:n, None])
-                - float(np.sum(w**2))
-                + model.sums_of_squares(w, basis[:n])
-            )
-            for w in white
-        ]
-    )
-    fisher = np.array([[0.5 * model.sums_of_squares(a, b) for b in white] for a in white])
-    return score, fisher
+    known = np.column_stack([right[:n], basis[:n]])
+    # Of every column: ‖ũᵀr‖² − ‖ũ‖² + ‖ũᵀQ‖², and of every two (ũᵀũ')², all within blocks.
+    score, fisher = -np.sum(white**2, axis=0), np.zeros((white.shape[1],) * 2)
+    for index in model.blocks:
+        part = white[index]
+        turned = np.swapaxes(part, 1, 2)
+        score += np.sum((turned @ known[index]) ** 2, axis=(0, 2))
+        fisher += np.sum((turned @ part) ** 2, axis=0)
+    member = model.membership
+    return 0.5 * member @ score, 0.5 * member @ fisher @ member.T

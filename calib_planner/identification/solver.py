@@ -147,7 +147,7 @@ def _gated(work: Work, found: Weighed) -> Weighed:
             break
         use = new
         check_count(work.problem, use)
-        found = weigh(work, use, found.fit.deviations)
+        found = weigh(work, use, found.fit.deviations, found.levels)
     return found
 
 

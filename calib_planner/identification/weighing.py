@@ -83,8 +83,15 @@ class Weighed:
         return (1.0 + 1e-6) * self.total + spread(rows, covariance) - inside
 
 
-def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
-    """Fit the points in use and split the scatter."""
+def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray, like: NoiseLevels | None = None) -> Weighed:
+    """Fit the points in use and split the scatter.
+
+    Args:
+        work: What is asked.
+        use: (N, targets) points in use.
+        first: (P,) deviations to begin from.
+        like: Levels of nearly the same points, to begin from.
+    """
     most = work.problem.iterations
     instrument, source = work.instrument, work.source
     equations = work.equations(use, instrument)
@@ -108,7 +115,7 @@ def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
     if source == "residuals":
         found = _with_scale(work, equations, fit, levels, freedom)
         apart = work.problem.discrepancy == "auto" and freedom >= FEWEST_SPARE and _targets_err_alike(work, found)
-        return _with_discrepancy(work, found, TINY * instrument) if apart else found
+        return _with_discrepancy(work, found, TINY * instrument, like) if apart else found
     cost = fit.cost
     levels = replace(levels, measurement=float(np.sqrt(np.mean(np.einsum("kii->k", instrument[use])) / 3.0)))
     covariance = fit.covariance()
@@ -117,7 +124,7 @@ def weigh(work: Work, use: NDArray[np.bool_], first: FloatArray) -> Weighed:
     told_by = repeats if source == "repetitions" else 0
     if work.problem.discrepancy == "off" or not improbable(cost, freedom, told_by) or seen <= len(work.kept):
         return found
-    return _with_discrepancy(work, found, instrument)
+    return _with_discrepancy(work, found, instrument, like)
 
 
 def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels, freedom: int) -> Weighed:
@@ -148,7 +155,7 @@ def _with_scale(work: Work, equations: Equations, fit: Fit, levels: NoiseLevels,
     return Weighed(equations, fit, levels, total, cross, covariance, float("nan"), freedom)
 
 
-def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Weighed:
+def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray, like: NoiseLevels | None) -> Weighed:
     """The same points with the scatter that they have, discrepancy included."""
     equations, data, columns = found.equations, work.problem.data, list(found.fit.kept)
     model = DiscrepancyModel.of(equations, instrument, work.labels)
@@ -156,7 +163,8 @@ def _with_discrepancy(work: Work, found: Weighed, instrument: FloatArray) -> Wei
     rows = jacobian[equations.use].reshape(-1, jacobian.shape[-1])[:, columns]
     prior = equations.prior_rows(found.fit.deviations)
     residuals = found.residuals[equations.use].ravel()
-    variances = estimate_variances(model, residuals, rows, (prior[0][:, columns], prior[1]))
+    start = None if like is None else np.array([getattr(like, name) ** 2 for name in model.names])
+    variances = estimate_variances(model, residuals, rows, (prior[0][:, columns], prior[1]), start)
     weights = instrument + model.mean_square(variances) * np.eye(3)
     equations = work.equations(equations.use, weights)
     fit = gauss_newton(equations, found.fit.deviations, found.fit.kept, work.problem.iterations)
