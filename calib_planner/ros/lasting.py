@@ -30,11 +30,8 @@ class LastingActionServer(ActionServer):
     def destroy(self) -> None:
         """Nobody waits for it any more; it goes when the last answer is out."""
         self._node.remove_waitable(self)
-        # Copies: a goal may just be arriving in another thread.
-        for goal in list(self._goal_handles.values()):
+        for goal in list(self._goal_handles.values()):  # a copy: one may just be arriving in another thread
             goal.destroy()
-        for future in list(self._result_futures.values()):
-            self.remove_future(future)
         self._handle.destroy_when_not_in_use()
 
     # ── the executor waits ───────────────────────────────────────────────────────────────────────────
