@@ -35,7 +35,7 @@ from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.files.campaign_journal import Journal, begin_journal, open_journal
 from calib_planner.ros.campaign_measuring import Measuring
 from calib_planner.ros.campaign_request import problem_of
-from calib_planner.ros.campaign_results import result_message, write_result
+from calib_planner.ros.campaign_results import reasons_of, result_message, write_result
 from calib_planner.ros.campaign_status import idle_status, status_message
 from calib_planner.ros.conversions import stamp_message
 from calib_planner.ros.lifecycle import ManagedNode
@@ -288,7 +288,9 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         if self._reported:
             return
         self._reported = True
-        self.get_logger().info(f"{result.verdict.level}, {result.outcome}: {result.message}")
+        self.get_logger().info(f"{result.outcome}: {result.message}")
+        for reason in reasons_of(result.verdict) or [result.verdict.level]:
+            self.get_logger().info(reason)
         message = result_message(result, self._id)
         if message is not None:
             message.header.stamp = stamp_message(self.get_clock().now().nanoseconds)
