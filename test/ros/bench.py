@@ -52,8 +52,9 @@ class Bench:
 
     def _spin(self, node: Node, threads: int) -> None:
         """Spin the node by an executor and in a thread of its own."""
-        kind = SingleThreadedExecutor if threads == 1 else MultiThreadedExecutor
-        executor = kind(context=self.context)
+        executor: Executor = SingleThreadedExecutor(context=self.context)
+        if threads > 1:
+            executor = MultiThreadedExecutor(num_threads=threads, context=self.context)
         executor.add_node(node)
 
         def work() -> None:
