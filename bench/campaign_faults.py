@@ -110,7 +110,7 @@ def given(faults: Faults, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
         "starts": 8,
         "seed": seed,
         "patience": 4.0,
-        "longest_wait": 20.0,
+        "longest_wait": 30.0,
         "most_failures": 5,
     }
     stores = {"store_folder": f"'{folder / 'store'}'"}

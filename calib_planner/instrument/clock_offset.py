@@ -7,11 +7,12 @@ as quick at its end as at its beginning, so the middles differ by τ and the len
 
     τ = (a' + b')/2 − (a + b)/2,      doubt = |(b' − a') − (b − a)|/2
 
-The offset of a target is the median of its last standstills. A beam that was broken shortens the target's
-interval and shows as doubt, a target that did not move at all has none. An offset shorter than the time left out
-after coming to rest does no harm to means over standstills. With a longer one they may hold ends of motions, as
-far as the tolerance of standing still lets them, or points of another standstill than the joints. Some such means
-were taken before an offset is seen: ``beyond`` names them.
+The offset of a target is the median of its last standstills; what was seen many rests of the joints ago does not
+count, or a target that nobody sees move any more would keep the offset that it had. A beam that was broken
+shortens the target's interval and shows as doubt, a target that did not move at all has none. An offset shorter
+than the time left out after coming to rest does no harm to means over standstills. With a longer one they may
+hold ends of motions, as far as the tolerance of standing still lets them, or points of another standstill than
+the joints. Some such means were taken before an offset is seen: ``beyond`` names them.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from statistics import median
 NANO = 1_000_000_000
 REMEMBERED = 5
 """Standstills that an offset is the median of; more would be longer in noticing that a clock was set."""
+LATELY = 9
+"""Rests of the joints after which what was seen is forgotten."""
 FEWEST = 3
 """Standstills without which there is no offset."""
 
@@ -61,7 +64,7 @@ class ClockOffsets:
     targets: int
     reach: int
     shortest: int
-    _joints: deque[Interval] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _joints: deque[Interval] = field(default_factory=lambda: deque(maxlen=LATELY))
     _points: list[deque[Interval]] = field(default_factory=list)
     _found: list[deque[tuple[int, int, Interval]]] = field(default_factory=list)  # (offset, doubt, joints) [ns]
 
@@ -71,7 +74,7 @@ class ClockOffsets:
     def clear(self) -> None:
         """Forget everything: a clock was set."""
         self._joints.clear()
-        self._points = [deque(maxlen=REMEMBERED) for _ in range(self.targets)]
+        self._points = [deque(maxlen=LATELY) for _ in range(self.targets)]
         self._found = [deque(maxlen=REMEMBERED) for _ in range(self.targets)]
 
     def add_joints(self, start: int, stop: int) -> None:
@@ -91,7 +94,7 @@ class ClockOffsets:
 
     def offset(self, target: int) -> Offset | None:
         """The offset of a target, from 0; ``None`` as long as too little was seen."""
-        found = self._found[target]
+        found = self._lately(target)
         if len(found) < FEWEST:
             return None
         seconds, doubt = (median(values) / NANO for values in list(zip(*found, strict=True))[:2])
@@ -102,7 +105,10 @@ class ClockOffsets:
         now = self.offset(target)
         if now is None or not now.exceeds(bound):
             return []
-        return [rest for offset, doubt, rest in self._found[target] if abs(offset) - doubt > bound * NANO]
+        return [rest for offset, doubt, rest in self._lately(target) if abs(offset) - doubt > bound * NANO]
+
+    def _lately(self, target: int) -> list[tuple[int, int, Interval]]:
+        return [f for f in self._found[target] if f[2] in self._joints]
 
     def _nearest(self, rest: Interval, others: deque[Interval]) -> Interval | None:
         """Which of the other stream's rests belongs to ``rest``."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_standstill import STOPS, feed, place, stream
 
-from calib_planner.instrument.clock_offset import FEWEST, ClockOffsets
+from calib_planner.instrument.clock_offset import FEWEST, LATELY, ClockOffsets
 from calib_planner.instrument.standstill import NANO, Standstill, StandstillDetector
 
 MANY = [*STOPS, *STOPS]
@@ -96,6 +96,17 @@ def test_rests_that_had_the_offset_are_named_and_no_others() -> None:
         noticed = found is not None and found.exceeds(0.1)
         assert noticed == (k >= 6)
         assert clocks.beyond(0, 0.1) == (rests[max(4, k - 4) : k + 1] if noticed else [])
+
+
+def test_a_target_that_is_not_seen_to_move_any_more_loses_its_offset() -> None:
+    clocks = ClockOffsets(1, NANO, 0)
+    for k in range(20):
+        if k < 6:
+            clocks.add_point(0, 4 * k * NANO + NANO // 3, (4 * k + 1) * NANO + NANO // 3)
+        clocks.add_joints(4 * k * NANO, (4 * k + 1) * NANO)
+        found = clocks.offset(0)
+        assert (found is not None and found.exceeds(0.1)) == (FEWEST - 1 <= k <= 3 + LATELY - 1)
+    assert clocks.beyond(0, 0.1) == []
 
 
 def test_a_doubtful_rest_is_not_named() -> None:
