@@ -2,69 +2,27 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from identify_runs import Run, fails, small_data
 from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations
 
 from calib_planner import Measurements, Robot
-from calib_planner.cli import main
-from calib_planner.files.bag import read_bag
-from calib_planner.files.bag_storage import BagTopics
 from calib_planner.files.estimate_yaml import read_estimate
 from calib_planner.files.kinematics_yaml import read_kinematics
 from calib_planner.files.measurements_csv import write_measurements
-from calib_planner.instrument.standstill import StandstillSettings
 from calib_planner.simulation import SimulatedCell
 
-Run = Callable[..., Any]
 PLAIN = ("--discrepancy", "off", "--joint-corrections", "off", "--starts", "0")
 """The paper's white noise alone, so that the results of two ways can be compared."""
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Identify; the JSON, or (stdout, stderr) with ``shown=True``."""
-
-    def call(*argv: object, shown: bool = False) -> Any:
-        words = ["identify", *map(str, argv), *(() if shown else ("--json",))]
-        assert main(words) == 0, capsys.readouterr().err
-        out, err = capsys.readouterr()
-        return (out, err) if shown else json.loads(out)
-
-    return call
-
-
-def fails(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str]:
-    """Exit status and the one line of a run that does not work."""
-    status = main(["identify", *map(str, argv)])
-    out, err = capsys.readouterr()
-    line = err.splitlines()[-1]
-    assert out == "" and "Traceback" not in err and line.startswith("calib-planner identify: ")
-    return status, line
-
-
 def values(result: dict[str, Any], key: str = "value") -> np.ndarray:
     return np.array([np.nan if p[key] is None else p[key] for p in result["parameters"]])
-
-
-def small_data(count: int = 12, seed: int = 1, **deviations: float) -> Measurements:
-    """planar_2r with hidden errors, in three dimensions thanks to a tracker's noise."""
-    robot = Robot.load("planar_2r")
-    cell = SimulatedCell(robot, deviations or {"l1": 1e-3, "dq2": -2e-3})
-    return cell.measure(random_configurations(robot, count, seed), 1, seed)
-
-
-@pytest.fixture
-def points(tmp_path: Path) -> Path:
-    path = tmp_path / "points.csv"
-    write_measurements(path, small_data())
-    return path
 
 
 @pytest.fixture
@@ -345,52 +303,6 @@ def test_the_source_is_not_overwritten(arm: tuple[Path, Path], capsys: pytest.Ca
     status, line = fails(capsys, *words)
     assert status == 2 and "another file than the nominal URDF" in line
     assert arm[0].read_text() == MIXED_URDF
-
-
-# ── bags ─────────────────────────────────────────────────────────────────────────────────────────────
-
-
-@pytest.fixture
-def bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """planar_2r at eight stops, on topics of its own."""
-    pytest.importorskip("rosbags")
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "files"))
-    from bags import campaign, write_bag
-
-    cell = SimulatedCell(Robot.load("planar_2r"), {"l1": 1e-3, "dq2": -2e-3})
-    said = campaign(cell, np.random.default_rng(2).uniform(-1.5, 1.5, (8, 2)))
-    return write_bag(tmp_path / "monday", said, topics=("/arm/joints", "/leica/point"))
-
-
-def test_a_bag_is_measurements(run: Run, bag: Path, tmp_path: Path) -> None:
-    """The same numbers as from its rows written as CSV; both kinds of files go together."""
-    topics = ("--joint-topic", "arm/joints", "--point-topic", "leica/point")
-    words = ("--robot", "planar_2r", "--repeatability", "2e-5", "--samples", "10", *topics)
-    found = run(*words, "--data", bag)
-    robot = Robot.load("planar_2r")
-    settings = StandstillSettings(samples=10)
-    rows = read_bag(bag, robot, BagTopics("arm/joints", ("leica/point",)), settings, repeatability=2e-5).data
-    path = tmp_path / "rows.csv"
-    write_measurements(path, rows)
-    expected = run("--robot", "planar_2r", "--data", path)
-    assert found["measurements"] == 8 and found["parameters"] == expected["parameters"]
-    _, err = run(*words, "--data", path, "--data", bag, shown=True)
-    assert f"{bag}: 8 standstills in frame tracker" in err and f"{bag}: /arm/joints: " in err
-    validated = run(*words, "--data", path, "--validate", bag)
-    assert validated["validation"]["count"] == 8
-
-
-def test_options_of_bags_need_one(points: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--robot", "planar_2r", "--data")
-    for more in (("--joint-topic", "x"), ("--settle", "0.1"), ("--accept-damaged",)):
-        status, line = fails(capsys, *words, points, *more)
-        assert status == 2 and more[0] in line and "a bag among --data or --validate" in line
-    status, line = fails(capsys, *words, bag, "--millimetres")
-    assert status == 2 and "--millimetres" in line and "REP-103" in line
-    status, line = fails(capsys, *words, bag)
-    assert status == 1 and "joint_states" in line and "/arm/joints" in line
-    status, line = fails(capsys, *words, bag, "--duration", "-1")
-    assert status == 2 and "duration" in line
 
 
 # ── real data ────────────────────────────────────────────────────────────────────────────────────────
