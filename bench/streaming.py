@@ -89,8 +89,8 @@ def measure(robot: Robot, data: Measurements, count: int, loss: str, updates: in
     before = begin.with_measurements(data.select(np.arange(count - 1)))
     _ = before.estimate
     rows: list[tuple[float, float]] = []
-    problem = before.problem
-    jacobian = min(processor(lambda: robot.positions_and_jacobian(problem.data.q)) for _ in range(20))
+    problem, moved = before.problem, np.full(len(robot.parameter_names), 1e-4)
+    jacobian = min(processor(lambda: robot.positions_and_jacobian(problem.data.q, moved)) for _ in range(20))
     undone, apart = [], []
     for k in range(count - 1, count - 1 + updates):
         after = before.with_configuration(data.q[k], data.p[k])
