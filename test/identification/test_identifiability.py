@@ -228,7 +228,8 @@ DEGENERATE = {
 }
 MAY_BE_NULL = {
     "chi_square.probability", "chi_square.value", "covariance", "geometry_accuracy_per_test_pose",
-    "hidden_joint_errors", "joint_corrections", "noise.measurement", "noise.repeatability", "normalised_residuals",
+    "hidden_joint_errors", "joint_corrections", "noise.measurement", "noise.repeatability",
+    "normalised_residuals",
     "parameter_accuracy_per_test_pose", "parameters.std", "predicted_accuracy",
     "predicted_accuracy_per_test_pose", "required_accuracy", "residuals", "sigma", "sigma_estimate",
     "moved_since", "disturbances.row", "disturbances.target",
