@@ -21,6 +21,8 @@ from calib_planner.errors import CalibPlannerError
 
 PATIENCE = 8.0
 """Seconds a process has to end after SIGINT before it is killed."""
+LAST_WORDS = 2.0
+"""Seconds it then has to say what it was doing."""
 
 
 class ProcessFailed(CalibPlannerError):
@@ -65,6 +67,7 @@ class Nodes:
             "ROS_DOMAIN_ID": str(domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONUNBUFFERED": "1",
+            "PYTHONFAULTHANDLER": "1",
         }
 
     def start(self, module: str, parameters: Mapping[str, object] | None = None) -> None:
@@ -120,8 +123,7 @@ class Nodes:
             try:
                 child.process.wait(max(deadline - time.monotonic(), 0.01))
             except subprocess.TimeoutExpired:
-                child.process.kill()
-                child.process.wait()
+                _abort(child.process)
         for child in children:
             if child.process.stdin is not None:
                 child.process.stdin.close()
@@ -138,6 +140,16 @@ class Nodes:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.end()
+
+
+def _abort(process: subprocess.Popen[bytes]) -> None:
+    """Kill it, but first have Python write to the log where each of its threads is."""
+    process.send_signal(signal.SIGABRT)
+    try:
+        process.wait(LAST_WORDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @contextmanager
