@@ -98,7 +98,8 @@ def select(
     freedom = max(3 * count + prior - len(columns), 1) / (3 * count + prior)
     weights, scale = np.ones(count), 1.0
     residuals, jacobian = equations.linearise(deviations)
-    straight = 0.0  # length of a step that did not bend: nor does a shorter one
+    # How far the points went since then, and how far they may go: so far nothing bent.
+    gone, straight = np.zeros(len(residuals)), 0.0
     for _ in range(50):
         squares = np.sum(residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
         scale = float(np.median(squares)) / MEDIAN / freedom
@@ -118,14 +119,15 @@ def select(
         if settled:
             break
         change = jacobian[:, columns] @ step
-        length = float(np.abs(change).max(initial=0.0))
-        residuals = residuals - change
-        if not length <= straight:
+        gone, residuals = gone + change, residuals - change
+        distance = float(np.abs(gone).max(initial=0.0))
+        if not distance <= straight:
             there = equations.residuals(deviations)
             if np.abs(there - residuals).max() < BENT * np.sqrt(scale):
-                residuals, straight = there, length
+                residuals, straight = there, distance
             else:
                 residuals, jacobian = equations.linearise(deviations)
+                gone, straight = np.zeros(len(residuals)), 0.0
     squares = np.sum(equations.residuals(deviations)[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     use = equations.use.copy()
     use[equations.use] = squares <= scale * gate_of(count) ** 2
