@@ -98,8 +98,8 @@ def select(
     freedom = max(3 * count + prior - len(columns), 1) / (3 * count + prior)
     weights, scale = np.ones(count), 1.0
     residuals, jacobian = equations.linearise(deviations)
-    # How far the points went since then, and how far they may go: so far nothing bent.
-    gone, straight = np.zeros(len(residuals)), 0.0
+    # Where the points went since then; up to which distance they were looked at, and what they bent by.
+    gone, straight, bend = np.zeros(len(residuals)), 0.0, 0.0
     for _ in range(50):
         squares = np.sum(residuals[: 3 * count].reshape(-1, 3) ** 2, axis=1)
         scale = float(np.median(squares)) / MEDIAN / freedom
@@ -121,13 +121,14 @@ def select(
         change = jacobian[:, columns] @ step
         gone, residuals = gone + change, residuals - change
         distance = float(np.abs(gone).max(initial=0.0))
-        if not distance <= straight:
+        most = BENT * np.sqrt(scale)  # less and less, as far points lose their weight
+        if not (distance <= straight and bend < most):
             there = equations.residuals(deviations)
-            if np.abs(there - residuals).max() < BENT * np.sqrt(scale):
-                residuals, straight = there, distance
-            else:
+            bend = float(np.abs(there - residuals).max())
+            residuals, straight = there, distance
+            if not bend < most:
                 residuals, jacobian = equations.linearise(deviations)
-                gone, straight = np.zeros(len(residuals)), 0.0
+                gone, straight, bend = np.zeros(len(residuals)), 0.0, 0.0
     squares = np.sum(equations.residuals(deviations)[: 3 * count].reshape(-1, 3) ** 2, axis=1)
     use = equations.use.copy()
     use[equations.use] = squares <= scale * gate_of(count) ** 2
