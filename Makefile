@@ -13,7 +13,7 @@ demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 	@. ./env.sh && python -m calib_planner.ros.demo
 
 test: setup ## run every test, in as many processes as there are cores (PYTEST='-k plan' for some)
-	@. ./env.sh && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PYTEST)
+	@. ./env.sh && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
 	@. ./env.sh && python tools/reference && \
