@@ -4,39 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from bench import Bench
 from builtin_interfaces.msg import Time
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
-from calib_planner_msgs.msg import Plan as PlanMessage
+from calib_planner_msgs.msg import Measurement
 from calib_planner_msgs.srv import UndoMeasurement
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from robots import plan_of, random_configurations
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from shift import NAME, Estimate, Shift, change
 from std_srvs.srv import Trigger
 
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.files.campaign_schema import FILE
 from calib_planner.instrument.standstill import NANO
-from calib_planner.robot.urdf import parse_urdf
 from calib_planner.ros.conversions import plan_to_message, point_message, stamp_message
 from calib_planner.ros.identifier_node import IdentifierNode
-from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_OUT
-from calib_planner.simulation import random_deviations
-
-NAME = "calibration_identifier"
-RELIABLE = {
-    f"qos_overrides./{topic}.subscription.reliability": "reliable" for topic in ("joint_states", "tracker/point")
-}
-"""So that a test that counts does not lose messages on a busy machine."""
-Estimate = CalibrationEstimate
+from calib_planner.ros.qos import EVENTS, LATCHED
 
 
 @pytest.fixture(scope="module")
@@ -47,78 +33,6 @@ def robot() -> Robot:
 @pytest.fixture(scope="module")
 def planned(robot: Robot) -> Plan:
     return plan(PlanProblem(robot, [0.3, 0.5], 4, starts=4, sigma=3e-5 / 20**0.5))
-
-
-class Shift:
-    """Publishes standstills, faster than real time: only stamps count."""
-
-    def __init__(self, bench: Bench, robot: Robot, /, estimates: int = 1, **parameters: Any) -> None:
-        self.bench, self.robot, self.stamp = bench, robot, 1_000 * NANO
-        self.truth = random_deviations(robot, 4)
-        self.true_robot = robot.with_deviations(self.truth)
-        self.rng = np.random.default_rng(4)
-        create = bench.client.create_publisher
-        self.joints = create(JointState, "joint_states", SENSOR_OUT)
-        self.points = create(PointStamped, "tracker/point", SENSOR_OUT)
-        self.plans = create(PlanMessage, "calibration_planner/current_plan", LATCHED)
-        self.estimates = bench.hear(Estimate, f"{NAME}/estimate", LATCHED)
-        self.measurements = bench.hear(Measurement, f"{NAME}/measurements", EVENTS)
-        self.node = bench.start(IdentifierNode, **({"robot": "planar_2r"} | RELIABLE | parameters))
-        self.sent, self.frame = 0, "laser"
-        bench.wait(lambda: self.joints.get_subscription_count() and self.points.get_subscription_count())
-        bench.wait(lambda: len(self.estimates) >= estimates)
-
-    def announce(self, planned: Plan, plan_id: str = "p") -> None:
-        self.plans.publish(plan_to_message(planned, plan_id, 0, "base"))
-        self.bench.wait(lambda: self.estimates[-1].plan_id == plan_id)
-
-    def rest(
-        self, q: Any, seconds: float = 0.8, shake: float = 0.0, error: float = 0.0, offset: float = 0.0
-    ) -> Measurement:
-        """Stand still at ``q`` with ``shake`` and ``error`` [m] on the point and its stamp ``offset`` [s] ahead.
-
-        Returns what becomes of it.
-        """
-        count = len(self.measurements)
-        self.stamp += NANO  # the way there: a gap, which ends a standstill
-        for i in range(int(seconds * 100)):
-            stamp = self.stamp + i * 10**7
-            state = JointState(name=["gripper", "q2", "q1"], position=[7.0, float(q[1]), float(q[0])])
-            state.header.stamp = stamp_message(stamp)
-            self.send(self.joints, state)
-            if i % 2:
-                xyz = self.true_robot.positions(q)[0, 0] + 3e-5 * self.rng.standard_normal(3)
-                xyz[0] += shake * np.sin(i) + error
-                self.send(self.points, point_message(xyz, stamp + round(offset * NANO), self.frame))
-        self.stamp += int(seconds * NANO)
-        self.bench.wait(lambda: self.sent == self.fed)
-        self.tick(q, offset)
-        self.bench.wait(lambda: len(self.measurements) > count)
-        return self.measurements[-1]
-
-    @property
-    def fed(self) -> int:
-        """Messages that the node took."""
-        return sum(w.messages for w in self.node._intake.watches)
-
-    def send(self, publisher: Any, message: Any, ahead: int = 10) -> None:
-        """Publish, and wait until all but the last ``ahead`` messages were taken."""
-        publisher.publish(message)
-        self.sent += 1
-        self.bench.wait(lambda: self.sent - self.fed <= ahead)
-
-    def tick(self, q: Any, offset: float = 0.0) -> None:
-        """Let time go on: one message of each stream after a gap, elsewhere."""
-        for k in (1, 2):
-            stamp = self.stamp + k * NANO // 2
-            state = JointState(name=["q1", "q2"], position=[float(q[0]) + 0.5, float(q[1])])
-            state.header.stamp = stamp_message(stamp)
-            self.send(self.joints, state, 0)
-            self.send(self.points, point_message(np.zeros(3), stamp + round(offset * NANO), self.frame), 0)
-        self.stamp += NANO
-
-    def service(self, name: str) -> Trigger.Response:
-        return self.bench.call(Trigger, f"{NAME}/{name}", Trigger.Request())
 
 
 @pytest.fixture
@@ -288,12 +202,6 @@ def test_a_configured_again_node_goes_on(bench: Bench, robot: Robot, planned: Pl
     assert np.allclose(after.value, before.value, rtol=0, atol=1e-12)
 
 
-def change(bench: Bench, transition: str) -> None:
-    """Have the only node make a transition, in its own thread."""
-    request = ChangeState.Request(transition=Transition(label=transition))
-    assert bench.call(ChangeState, f"{NAME}/change_state", request, 30.0, 1).success
-
-
 def test_services_of_a_node_that_is_not_active_say_so(bench: Bench) -> None:
     bench.start(IdentifierNode, robot="planar_2r", autostart=False)
     change(bench, "configure")
@@ -332,81 +240,6 @@ def test_a_folder_that_cannot_be_opened_yet(bench: Bench, robot: Robot, planned:
     assert (tmp_path / "blocked" / FILE).exists()
     assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
     assert shift.estimates[-1].plan_id == "p"
-
-
-# ── robot descriptions ───────────────────────────────────────────────────────────────────────────────
-
-ARM = """<robot name="arm"><link name="base"/><link name="a"/><link name="b"/><link name="c"/><link name="tip"/>
-<joint name="j1" type="revolute"><origin xyz="0 0 0.3"/><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
-<joint name="j2" type="revolute"><origin xyz="0.1 0 0.2"/><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>
-<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-<joint name="j3" type="revolute"><origin xyz="0.5 0 0"/><parent link="b"/><child link="c"/><axis xyz="0 1 0"/>
-<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-<joint name="flange" type="fixed"><origin xyz="0.4 0 0.1"/><parent link="c"/><child link="tip"/></joint></robot>
-"""
-
-
-class ArmShift(Shift):
-    """The same with a robot out of a URDF, in its own joints."""
-
-    def rest(self, q: Any, **others: Any) -> Measurement:  # type: ignore[override]
-        count = len(self.measurements)
-        self.stamp += NANO
-        names = list(self.robot.joint_names)
-        point = self.true_robot.positions(q)[0, 0] + 1e-5 * self.rng.standard_normal(3)
-        for away in (0.0, 0.5):
-            for i in range(80 if not away else 2):
-                stamp = self.stamp + i * (10**7 if not away else NANO // 2)
-                state = JointState(name=names, position=(np.asarray(q) + away).tolist())
-                state.header.stamp = stamp_message(stamp)
-                self.send(self.joints, state, 0)
-                self.send(self.points, point_message(point, stamp, "laser"), 0)
-            self.stamp += 2 * NANO
-        self.bench.wait(lambda: len(self.measurements) > count)
-        return self.measurements[-1]
-
-
-def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
-    robot = parse_urdf(ARM, "arm").with_parameters("lengths+offsets")
-    descriptions = bench.client.create_publisher(String, "robot_description", LATCHED)
-    calibrated = bench.hear(String, f"{NAME}/robot_description", LATCHED)
-    shift = ArmShift(bench, robot, robot="", store_folder=str(tmp_path), estimates=0)
-    assert "robot_description" in shift.node._waiting
-    assert "robot_description" in shift.service("undo").message
-    descriptions.publish(String(data=ARM))
-    bench.wait(lambda: calibrated and shift.estimates)
-    assert calibrated[0].data == ARM
-    planned = plan_of(robot, random_configurations(robot, 12))
-    shift.announce(planned)
-    for q in planned.configurations:
-        assert shift.rest(q).status == Measurement.ACCEPTED
-    bench.wait(lambda: shift.estimates[-1].complete)
-    bench.wait(lambda: calibrated[-1].data != ARM)
-    published = parse_urdf(calibrated[-1].data, "calibrated")
-    estimate = shift.node._campaign.newest
-    q = random_configurations(robot, 5, 1)
-    assert np.allclose(published.positions(q), estimate.calibrated.positions(q), atol=1e-12)
-    assert shift.service("save").success
-    assert (tmp_path / "calibrated_p.urdf").read_text() == calibrated[-1].data
-
-    descriptions.publish(String(data=ARM.replace("0.5 0 0", "0.6 0 0")))
-    bench.wait(lambda: "refused" in shift.node._waiting)
-    assert shift.node._campaign.nominal.name == "arm" and len(shift.node._campaign.kept) == 12
-    change(bench, "deactivate")
-    change(bench, "cleanup")
-    again = bench.start(IdentifierNode, robot="", store_folder=str(tmp_path))
-    assert again._campaign.nominal.joint_names == robot.joint_names and len(again._campaign.kept) == 12
-
-
-@pytest.mark.parametrize("text", ["", "<robot", "<!DOCTYPE a [<!ENTITY b 'c'>]><robot/>", "x" * 5_000_000])
-def test_a_bad_description_changes_nothing(bench: Bench, robot: Robot, planned: Plan, text: str) -> None:
-    shift = Shift(bench, robot)
-    descriptions = bench.client.create_publisher(String, "robot_description", LATCHED)
-    descriptions.publish(String(data=text))
-    bench.wait(lambda: "refused" in shift.node._waiting)
-    shift.announce(planned)
-    assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
 
 
 def test_two_targets(bench: Bench) -> None:
