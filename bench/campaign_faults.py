@@ -63,8 +63,8 @@ MEASUREMENTS, SPAN = 16, 20.0
 HALF = MEASUREMENTS // 2
 DOMAINS = range(215, 233)
 """Above the ports that the system gives away."""
-ENDS = ("PASS", "WARN", "FAIL", "wrong", "lost", "crash", "hung")
-BAD = ENDS[3:]
+BAD = ("wrong", "lost", "crash", "hung")
+ENDS = ("PASS", "WARN", "FAIL", *BAD)
 S = CampaignStatus
 
 
@@ -116,9 +116,8 @@ def given(faults: Faults, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
         "longest_wait": 30.0,
         "most_failures": 5,
     }
-    stores = {"store_folder": f"'{folder / 'store'}'"}
     return {
-        "identifier_node": identifier | stores,
+        "identifier_node": identifier | {"store_folder": f"'{folder / 'store'}'"},
         "simulator_node": simulator | off,
         "campaign_node": campaign | {"store_folder": f"'{folder / 'results'}'"},
     }
