@@ -47,8 +47,8 @@ from rich.table import Table
 from sensor_msgs.msg import JointState
 
 from calib_planner import PlanProblem, Robot, __version__, plan
-from calib_planner.files.campaign_store import open_store
-from calib_planner.instrument.standstill import NANO, Standstill
+from calib_planner.acquisition import NANO, Standstill
+from calib_planner.io import open_store
 from calib_planner.ros.campaign import Campaign, Matching
 from calib_planner.ros.conversions import stamp_message
 from calib_planner.ros.identified_model import first_model

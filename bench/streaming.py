@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot, identify
+from calib_planner.identification import Estimate
 from calib_planner.identification.accumulator import Accumulator
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
+from calib_planner.measurements import Measurements
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 SIGMA, LENGTH, ANGLE = 3e-5, 5e-4, 1e-3

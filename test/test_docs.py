@@ -31,7 +31,7 @@ def record_bag(folder: Path) -> None:
     from bags import campaign, write_bag
 
     from calib_planner import Robot
-    from calib_planner.files.measurements_csv import read_measurements
+    from calib_planner.io import read_measurements
     from calib_planner.simulation import SimulatedCell, random_deviations
 
     robot = Robot.load(DOCS / "examples" / "ur10e.urdf").with_targets([[0.06, 0.0, 0.03]])

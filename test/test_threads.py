@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib_planner import IdentificationProblem, Robot, _threads, identify
-from calib_planner._threads import ONE_THREAD, one_thread
+from calib_planner.arrays import ONE_THREAD, one_thread
 from calib_planner.identification import solver
 from calib_planner.simulation import SimulatedCell, random_deviations
 

@@ -18,19 +18,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
-from calib_planner.design.plan import Plan
+from calib_planner.acquisition import Rejection, Standstill, mean_std
+from calib_planner.arrays import FloatArray
 from calib_planner.errors import CalibPlannerError, InputError, NotEnoughDataError, StoreError, UnknownNameError
-from calib_planner.files.campaign_records import ACCEPTED, KEPT, OUTLIER, UNDONE, Decision
-from calib_planner.files.campaign_store import CampaignStore, StoredCampaign
-from calib_planner.identification.accumulator import UPDATE
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.problem import IdentificationProblem
-from calib_planner.identification.solver import identify
-from calib_planner.instrument.standstill import Rejection, Standstill
-from calib_planner.instrument.standstill_noise import mean_std
-from calib_planner.robot.chain import Robot
+from calib_planner.identification import UPDATE, Estimate, IdentificationProblem, identify
+from calib_planner.io import ACCEPTED, KEPT, OUTLIER, UNDONE, CampaignStore, Decision, StoredCampaign
+from calib_planner.measurements import Measurements
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot
 
 MOST_REJECTIONS = 10_000
 """Rejected standstills of a campaign that are written; more are only counted: nobody shall fill the disk."""

@@ -16,10 +16,10 @@ from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import Measurement
 from rclpy.publisher import Publisher
 
-from calib_planner._arrays import FloatArray
-from calib_planner.adaptive.campaign import FIT, CampaignState, Measure
+from calib_planner.acquisition import pick_joints
+from calib_planner.arrays import FloatArray
+from calib_planner.campaign import FIT, CampaignState, Measure
 from calib_planner.errors import InputError
-from calib_planner.instrument.joint_state import pick_joints
 from calib_planner.ros.campaign_request import Announced, announced
 from calib_planner.ros.conversions import plan_to_message
 from calib_planner.ros.lifecycle import ManagedNode

@@ -28,11 +28,18 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from calib_planner.adaptive.campaign import CampaignState, Decision, Finished, Measure, Paused, begin
-from calib_planner.adaptive.decision import decide
-from calib_planner.adaptive.result import CampaignResult
+from calib_planner.campaign import (
+    CampaignResult,
+    CampaignState,
+    Decision,
+    Finished,
+    Measure,
+    Paused,
+    begin,
+    decide,
+)
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
-from calib_planner.files.campaign_journal import Journal, begin_journal, open_journal
+from calib_planner.io import Journal, begin_journal, open_journal
 from calib_planner.ros.campaign_measuring import Measuring
 from calib_planner.ros.campaign_request import problem_of
 from calib_planner.ros.campaign_results import reasons_of, result_message, write_result

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib_planner.adaptive.campaign import CampaignState
-from calib_planner.adaptive.problem import CampaignProblem
-from calib_planner.design.plan import Plan
+from calib_planner.campaign import CampaignProblem, CampaignState
 from calib_planner.errors import InputError
+from calib_planner.planning import Plan
 from calib_planner.ros.model_source import Model, NotReady
 from calib_planner.ros.planning import constraints_of
 from calib_planner.ros.settings import CampaignParameters, unknown_words, with_topics

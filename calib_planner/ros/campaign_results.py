@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from calib_planner_msgs.msg import CalibrationEstimate
 
-from calib_planner.adaptive.result import CampaignResult
-from calib_planner.files.estimate_yaml import write_estimate
-from calib_planner.files.measurements_csv import write_measurements
-from calib_planner.identification.verdict import Verdict
+from calib_planner.campaign import CampaignResult
+from calib_planner.identification import Verdict
+from calib_planner.io import write_estimate, write_measurements
 from calib_planner.ros.conversions import estimate_to_message
 from calib_planner.ros.saving import confined
 

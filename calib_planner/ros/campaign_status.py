@@ -6,8 +6,7 @@ import math
 
 from calib_planner_msgs.msg import CampaignStatus
 
-from calib_planner.adaptive.campaign import FIT, VALIDATION, CampaignState, Finished, Measure, Paused
-from calib_planner.adaptive.result import CampaignResult
+from calib_planner.campaign import FIT, VALIDATION, CampaignResult, CampaignState, Finished, Measure, Paused
 from calib_planner.ros.campaign_results import reasons_of
 
 OUTCOME = {

@@ -18,11 +18,10 @@ from geometry_msgs.msg import Point, PointStamped, Vector3
 from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
 
-from calib_planner._arrays import FloatArray, check_array, check_number
-from calib_planner.design.plan import Plan
+from calib_planner.acquisition import NANO, Reason, Rejection, Standstill, pick_joints
+from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
-from calib_planner.instrument.joint_state import pick_joints
-from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
+from calib_planner.planning import Plan
 
 MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""

@@ -23,10 +23,10 @@ from calib_planner_msgs.srv import PlanCalibration
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from calib_planner.design.problem import PlanProblem
+from calib_planner.demo import DemoResult, demo_report, draw, print_table
 from calib_planner.errors import CalibPlannerError
-from calib_planner.report.demo_report import DemoResult, demo_report, draw, print_table
-from calib_planner.robot.chain import Robot
+from calib_planner.planning import PlanProblem
+from calib_planner.robot import Robot
 from calib_planner.ros.conversions import estimate_from_message, plan_from_message
 from calib_planner.ros.demo_client import DemoClient
 from calib_planner.ros.processes import Nodes, own_domain

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from calib_planner.files.campaign_store import UnavailableStore
-from calib_planner.identification.estimate import Estimate
-from calib_planner.instrument.clock_offset import Offset
+from calib_planner.acquisition import Offset
+from calib_planner.identification import Estimate
+from calib_planner.io import UnavailableStore
 from calib_planner.ros.campaign import Campaign, condition_of
 from calib_planner.ros.conversions import stamp_message
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_planner.design.plan import Plan
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.chain import Robot
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot
 
 MOST_STANDSTILLS = 100_000
 """Standstills of one plan; at a second each that is more than a day."""

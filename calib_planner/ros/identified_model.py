@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calib_planner.design.plan import Plan
-from calib_planner.files.campaign_store import StoredModel, stored_model
-from calib_planner.files.text import read_text
-from calib_planner.robot.chain import Robot
+from calib_planner.io import StoredModel, read_text, stored_model
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot
 from calib_planner.ros.model_source import TOPIC, described_model
 from calib_planner.ros.settings import IdentifierParameters, load_shipped, unknown_words, with_topics
 

@@ -26,10 +26,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner import __version__
+from calib_planner.acquisition import Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
-from calib_planner.files.campaign_records import ACCEPTED
-from calib_planner.files.campaign_store import UnavailableStore, open_store
-from calib_planner.instrument.standstill import Rejection, Standstill
+from calib_planner.io import ACCEPTED, UnavailableStore, open_store
 from calib_planner.ros import saving
 from calib_planner.ros.campaign import Campaign, Matching
 from calib_planner.ros.conversions import ReceivedPlan, plan_from_message

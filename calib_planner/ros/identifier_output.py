@@ -6,9 +6,8 @@ from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
 
-from calib_planner.files.campaign_records import Decision
-from calib_planner.files.urdf_output import calibrated_urdf
-from calib_planner.identification.estimate import Estimate
+from calib_planner.identification import Estimate
+from calib_planner.io import Decision, calibrated_urdf
 from calib_planner.ros.campaign import Campaign, TooFew, condition_of
 from calib_planner.ros.conversions import (
     ESTIMATE_STATUS,

@@ -15,11 +15,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray, frozen
+from calib_planner.arrays import FloatArray, frozen
 from calib_planner.errors import CalibPlannerError, FileFormatError
-from calib_planner.files.urdf_speeds import parse_speed_limits
-from calib_planner.robot.chain import Robot
-from calib_planner.robot.urdf import parse_urdf
+from calib_planner.io import parse_speed_limits, parse_urdf
+from calib_planner.robot import Robot
 from calib_planner.ros.settings import PlannerParameters, load_shipped, unknown_words
 
 TOPIC = "robot_description"

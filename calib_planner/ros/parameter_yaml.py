@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import Field, fields
 from typing import Any
 
-from calib_planner.robot.catalogue import config_folder
+from calib_planner.io import config_folder
 from calib_planner.ros.parameters import constraints_text
 from calib_planner.ros.settings import (
     CampaignParameters,

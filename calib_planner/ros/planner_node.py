@@ -28,8 +28,8 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from calib_planner.design.planner import Progress
 from calib_planner.errors import CalibPlannerError
+from calib_planner.planning import Progress
 from calib_planner.ros.conversions import plan_to_message
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.markers import plan_markers

@@ -14,16 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
-from calib_planner.design.discrepancy import ModelDiscrepancy
-from calib_planner.design.feasibility import Constraint
-from calib_planner.design.plan import Plan
-from calib_planner.design.planner import Progress, plan
-from calib_planner.design.problem import PlanProblem
+from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.files.constraints_yaml import read_constraints
-from calib_planner.robot.catalogue import config_folder
-from calib_planner.robot.chain import Robot
+from calib_planner.io import config_folder, read_constraints
+from calib_planner.planning import Constraint, ModelDiscrepancy, Plan, PlanProblem, Progress, plan
+from calib_planner.robot import Robot
 from calib_planner.ros.conversions import check_rows
 from calib_planner.ros.model_source import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, unknown_words

@@ -12,13 +12,9 @@ import re
 from pathlib import Path
 
 from calib_planner.errors import InputError, NotEnoughDataError
-from calib_planner.files.estimate_yaml import write_estimate
-from calib_planner.files.measurements_csv import write_measurements
-from calib_planner.files.text import write_text
-from calib_planner.files.urdf_output import calibrated_urdf
-from calib_planner.identification.estimate import Estimate
-from calib_planner.report.calibration_report import write_report
-from calib_planner.report.provenance import InputFile, Provenance
+from calib_planner.identification import Estimate
+from calib_planner.io import calibrated_urdf, write_estimate, write_measurements, write_text
+from calib_planner.report import InputFile, Provenance, write_report
 from calib_planner.ros.campaign import Campaign, Matching
 
 FIELD = "save_folder"

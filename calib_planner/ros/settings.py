@@ -7,14 +7,14 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from calib_planner.design.criteria import CRITERIA
+from calib_planner.acquisition import StandstillSettings
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.instrument.standstill import StandstillSettings
-from calib_planner.robot.catalogue import config_folder, shipped_robots
-from calib_planner.robot.chain import Robot
+from calib_planner.io import config_folder, shipped_robots
+from calib_planner.planning import CRITERIA
+from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import LifecycleParameters
 from calib_planner.ros.parameters import parameter
-from calib_planner.simulation.faults import Faults
+from calib_planner.simulation import Faults
 
 ROBOT = "shipped robot name"
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas"

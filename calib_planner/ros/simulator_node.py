@@ -23,17 +23,24 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from calib_planner.errors import CalibPlannerError, InputError
-from calib_planner.files.instrument_yaml import read_instrument
-from calib_planner.robot.catalogue import config_folder
+from calib_planner.io import config_folder, read_instrument
 from calib_planner.ros.conversions import joints_message, plan_from_message, point_message
 from calib_planner.ros.execution import check_executable
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.qos import SENSOR_OUT
 from calib_planner.ros.run import run
 from calib_planner.ros.settings import SimulatorParameters, load_shipped
-from calib_planner.simulation import Itinerary, Rates, SimulatedCell, Streams, Tour, World, make_tour
-from calib_planner.simulation.cell import random_deviations
-from calib_planner.simulation.motion import NANO
+from calib_planner.simulation import (
+    NANO,
+    Itinerary,
+    Rates,
+    SimulatedCell,
+    Streams,
+    Tour,
+    World,
+    make_tour,
+    random_deviations,
+)
 
 FEEDBACK_PERIOD = 0.1
 """Time between two looks at the execution [s]."""

@@ -13,11 +13,7 @@ import numpy as np
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import JointState
 
-from calib_planner._arrays import FloatArray
-from calib_planner.errors import InputError
-from calib_planner.files.campaign_records import LONGEST
-from calib_planner.instrument.joint_state import pick_joints
-from calib_planner.instrument.standstill import (
+from calib_planner.acquisition import (
     IN_A_ROW,
     NANO,
     Reason,
@@ -25,7 +21,11 @@ from calib_planner.instrument.standstill import (
     Standstill,
     StandstillDetector,
     StandstillSettings,
+    pick_joints,
 )
+from calib_planner.arrays import FloatArray
+from calib_planner.errors import InputError
+from calib_planner.io import LONGEST
 from calib_planner.ros.conversions import nanoseconds
 from calib_planner.ros.diagnostics import StreamHealth
 

@@ -6,11 +6,10 @@ import numpy as np
 from builtin_interfaces.msg import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from calib_planner._arrays import FloatArray
-from calib_planner.design.plan import Plan
-from calib_planner.design.timetable import Pace, timetable
-from calib_planner.instrument.standstill import NANO
-from calib_planner.robot.chain import Robot
+from calib_planner.acquisition import NANO
+from calib_planner.arrays import FloatArray
+from calib_planner.planning import Pace, Plan, timetable
+from calib_planner.robot import Robot
 from calib_planner.ros.conversions import stamp_message
 
 

@@ -12,9 +12,8 @@ from identify_runs import Run, fails, small_data
 from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations
 
 from calib_planner import Measurements, Robot
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.kinematics_yaml import read_kinematics
-from calib_planner.files.measurements_csv import write_measurements
+from calib_planner.io import read_estimate, write_measurements
+from calib_planner.io.kinematics import read_kinematics
 from calib_planner.simulation import SimulatedCell
 
 PLAIN = ("--discrepancy", "off", "--joint-corrections", "off", "--starts", "0")

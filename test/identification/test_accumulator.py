@@ -11,10 +11,9 @@ import pytest
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
+from calib_planner.identification import Estimate, typical_prior
 from calib_planner.identification import accumulator as room
 from calib_planner.identification.accumulator import UPDATE, Accumulator
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.prior import typical_prior
 from calib_planner.robot.elements import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 

@@ -11,11 +11,10 @@ from cells import POSE, ROUND, WrongRobot, bare
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
+from calib_planner.identification import DOUBT, JointCorrections, phases
 from calib_planner.identification.accumulator import Accumulator
-from calib_planner.identification.hidden_errors import LENGTH, TYPICAL
-from calib_planner.identification.noise_levels import DOUBT
+from calib_planner.identification.checks import LENGTH, TYPICAL
 from calib_planner.identification.transmission import spectrum
-from calib_planner.robot.joint_corrections import JointCorrections, phases
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KUKA = Robot.load("kuka_kr270")

@@ -16,9 +16,9 @@ import pytest
 from robots import plan_of, random_configurations
 
 from calib_planner import Estimate, Plan, Robot
+from calib_planner.acquisition import NANO, Reason, Rejection, Standstill
 from calib_planner.errors import InputError, StoreError
-from calib_planner.files.campaign_store import CampaignStore, StoredModel, UnavailableStore, open_store
-from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
+from calib_planner.io import CampaignStore, StoredModel, UnavailableStore, open_store
 from calib_planner.ros.campaign import MOST_REJECTIONS, NOT_STORED, Campaign, Matching, condition_of
 from calib_planner.simulation import random_deviations
 

@@ -19,9 +19,8 @@ from fake_cell import FakeCell
 from rclpy.parameter import Parameter
 
 from calib_planner import Robot
-from calib_planner.files.campaign_journal import FILE
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.measurements_csv import read_measurements
+from calib_planner.io import read_estimate, read_measurements
+from calib_planner.io.journal import FILE
 from calib_planner.ros import campaign_measuring
 from calib_planner.ros.campaign_node import CampaignNode
 from calib_planner.ros.conversions import estimate_from_message

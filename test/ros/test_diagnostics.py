@@ -12,10 +12,9 @@ from sensor_msgs.msg import JointState
 from test_campaign_goes_on import HOW, PLAN, ROBOT, begun, measure, opened, seen
 
 from calib_planner import Estimate
+from calib_planner.acquisition import NANO, Offset, StandstillSettings
 from calib_planner.errors import InputError, StoreError
-from calib_planner.files.campaign_store import StoredModel, UnavailableStore
-from calib_planner.instrument.clock_offset import Offset
-from calib_planner.instrument.standstill import NANO, StandstillSettings
+from calib_planner.io import StoredModel, UnavailableStore
 from calib_planner.ros.campaign import Campaign
 from calib_planner.ros.conversions import joints_message, point_message, stamp_message
 from calib_planner.ros.diagnostics import StreamHealth, diagnostics

@@ -20,7 +20,7 @@ import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 
-from calib_planner.robot.catalogue import config_folder
+from calib_planner.io import config_folder
 from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.planner_node import PlannerNode
 from calib_planner.ros.settings import (

@@ -17,7 +17,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.catalogue import config_folder
+from calib_planner.io import config_folder
 from calib_planner.ros import parameter_yaml
 from calib_planner.ros.campaign_node import CampaignNode
 from calib_planner.ros.identifier_node import IdentifierNode

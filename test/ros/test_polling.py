@@ -10,7 +10,7 @@ from bench import Bench, overrides
 from geometry_msgs.msg import PointStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from calib_planner.instrument.standstill import NANO
+from calib_planner.acquisition import NANO
 from calib_planner.ros.conversions import nanoseconds, point_message
 from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
 from calib_planner.ros.polling import EVENTS_EVERY, MOST_AT_ONCE, Stream, StreamPoller
