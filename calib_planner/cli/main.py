@@ -26,7 +26,7 @@ COMMANDS = {
     "identify": ("calib_planner.cli.identify", "identify parameters from measurements"),
     "compensate": (
         "calib_planner.cli.compensate",
-        "corrected joint targets for a controller with the nominal model",
+        "joint targets corrected for a nominal controller",
     ),
     "simulate": ("calib_planner.cli.simulate", "measure a plan with a simulated robot"),
     "robots": ("calib_planner.cli.robots", "list the shipped robots, or show one"),
@@ -102,9 +102,7 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
         except ModuleNotFoundError as error:
             if error.name != "calib_planner_paper":
                 raise
-            top.exit(
-                FAILED, f"calib-planner {name}: needs the package calib_planner_paper, in the folder paper/\n"
-            )
+            top.exit(FAILED, f"calib-planner {name}: install calib_planner_paper, see the folder paper/\n")
     return top
 
 
