@@ -14,7 +14,7 @@ from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Robot, identify, validate
 from calib_planner.identification import LEVELS, cross_validate
-from calib_planner.identification import verdict as module
+from calib_planner.identification import estimate as module
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KUKA = Robot.load("kuka_kr270")

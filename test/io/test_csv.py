@@ -14,10 +14,10 @@ from robots import mixed
 
 from calib_planner import FileFormatError, Measurements, Robot
 from calib_planner.io import (
+    csv,
     read_configurations,
     read_measurements,
     read_plan_csv,
-    table,
     text,
     write_configurations,
     write_measurements,
@@ -153,7 +153,7 @@ def test_repetitions_are_whole(tmp_path: Path, cell: str) -> None:
 
 def test_huge_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = put(tmp_path, GOOD + "0.1,0.2,1,2,3\n" * 10)
-    monkeypatch.setattr(table, "MAX_ROWS", 5)
+    monkeypatch.setattr(csv, "MAX_ROWS", 5)
     with pytest.raises(FileFormatError, match="at most 5, got 11; split the file"):
         read_measurements(path, PLANAR)
     monkeypatch.setattr(text, "MAX_BYTES", 100)

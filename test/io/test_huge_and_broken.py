@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from calib_planner import CalibPlannerError, FileFormatError, Robot
-from calib_planner.io import read_configurations, read_measurements, read_plan_csv, table, text
+from calib_planner.io import csv, read_configurations, read_measurements, read_plan_csv, text
 
 PLANAR = Robot.load("planar_2r")
 HEADER = "q1,q2,x1,y1,z1\n"
@@ -149,9 +149,9 @@ def test_configurations_are_read_the_same_way(tmp_path: Path, read: Callable, ca
 
 
 def test_many_rows_are_all_there_and_in_order(tmp_path: Path) -> None:
-    values = np.random.default_rng(0).standard_normal((3 * table.BLOCK + 7, 5))
+    values = np.random.default_rng(0).standard_normal((3 * csv.BLOCK + 7, 5))
     lines = [",".join(map(repr, row)) for row in values.tolist()]
-    holes = [5, table.BLOCK - 1, table.BLOCK, len(lines) - 1]
+    holes = [5, csv.BLOCK - 1, csv.BLOCK, len(lines) - 1]
     for i in holes:
         lines[i] = ",".join([*lines[i].split(",")[:2], "", "", ""])
         values[i, 2:] = np.nan
@@ -160,13 +160,13 @@ def test_many_rows_are_all_there_and_in_order(tmp_path: Path) -> None:
     np.testing.assert_array_equal(data.q, values[:, :2])
     np.testing.assert_array_equal(data.p[:, 0], values[:, 2:])
     bad = lines.copy()
-    bad[2 * table.BLOCK] = "0,0,1,2,x"
+    bad[2 * csv.BLOCK] = "0,0,1,2,x"
     message = refused(put(tmp_path, HEADER + "\n".join(bad)))
-    assert f"line {2 * table.BLOCK + 2}, column z1" in message
+    assert f"line {2 * csv.BLOCK + 2}, column z1" in message
 
 
 def test_too_many_rows_are_counted(tmp_path: Path) -> None:
-    path = put(tmp_path, HEADER + "0,0,0,0,0\n" * (table.MAX_ROWS + 1))
+    path = put(tmp_path, HEADER + "0,0,0,0,0\n" * (csv.MAX_ROWS + 1))
     assert "at most 1000000, got 1000001" in refused(path)
 
 

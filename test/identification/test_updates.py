@@ -1,4 +1,4 @@
-"""One configuration at a time gives what all at once give, whatever came and went in between."""
+"""An estimate that starts at the last one is that of the same measurements at once, whatever came and went."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
-from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
-from calib_planner.identification import Estimate, typical_prior
-from calib_planner.identification import accumulator as room
-from calib_planner.identification.accumulator import UPDATE, Accumulator
+from calib_planner.errors import InputError, NotEnoughDataError
+from calib_planner.identification import UPDATE, Estimate, typical_prior
 from calib_planner.robot.elements import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -155,34 +153,43 @@ def assert_same(one: Estimate | None, other: Estimate | None) -> None:
     )
 
 
-def streamed(robot: Robot, data: Measurements, settings: dict[str, Any]) -> list[Accumulator]:
-    """After each configuration; every estimate has been asked for."""
-    states = [Accumulator.begin(robot, **settings)]
-    for i in range(len(data)):
-        std = None if data.std is None else np.asarray(data.std)[i]
-        states.append(states[-1].with_configuration(data.q[i], data.p[i], std))
-        _ = states[-1].estimate
-    return states
+def updated(problem: IdentificationProblem, last: Estimate | None) -> Estimate | None:
+    """The next estimate as the identifier node makes it: from the last one, once that can only be near."""
+    near = last is not None and last.status != "not_converged" and 3 * last.used >= 2 * len(last.parameters)
+    try:
+        return identify(problem, last if near else None)
+    except NotEnoughDataError:
+        return None
+
+
+def streamed(robot: Robot, data: Measurements, settings: dict[str, Any]) -> list[Estimate | None]:
+    """The estimate before any configuration, and after each."""
+    estimates: list[Estimate | None] = [None]
+    for count in range(1, len(data) + 1):
+        problem = IdentificationProblem(robot, data.select(np.arange(count)), **{**UPDATE, **settings})
+        estimates.append(updated(problem, estimates[-1]))
+    return estimates
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_same_as_all_at_once(name: str) -> None:
     robot, data, settings = CASES[name]()
     settings = {**UPDATE, **settings}
-    states = streamed(robot, data, settings)
+    estimates = streamed(robot, data, settings)
     for count in (*range(1, 9), *range(9, len(data), 3), len(data)):
         problem = IdentificationProblem(robot, data.select(np.arange(count)), **settings)
-        assert_same(states[count].estimate, at_once(problem))
-    final = states[-1].estimate
-    assert final is not None and final.status != "not_converged"
+        assert_same(estimates[count], at_once(problem))
+    newest = estimates[-1]
+    assert newest is not None and newest.status != "not_converged"
     # Undo, in an order of its own, down to too few.
-    now = states[-1]
-    for number in np.random.default_rng(1).permutation(len(data)).tolist():
-        now = now.without(number)
-        if len(now) % 4 == 0 and len(now):
-            rest = data.select(np.array(now.ids))
-            assert_same(now.estimate, at_once(IdentificationProblem(robot, rest, **settings)))
-    assert now.estimate is None and now.data is None and len(now) == 0
+    rows = list(range(len(data)))
+    for number in np.random.default_rng(1).permutation(len(data)).tolist()[:-1]:
+        rows.remove(number)
+        problem = IdentificationProblem(robot, data.select(np.array(rows)), **settings)
+        newest = updated(problem, newest)
+        if len(rows) % 4 == 0:
+            assert_same(newest, at_once(problem))
+    assert newest is None
 
 
 def test_the_cases_are_what_they_are_called() -> None:
@@ -193,15 +200,15 @@ def test_the_cases_are_what_they_are_called() -> None:
     assert rejected(estimates["robust, base unknown"])
     assert estimates["discrepancy"].noise.discrepancy > SIGMA / 2
     assert estimates["repetitions"].noise.repeat_freedom == 12 * 2 * 3
-    ranks = [e.rank for s in streamed(*cases["rank grows"]) if (e := s.estimate) is not None]
+    ranks = [e.rank for e in streamed(*cases["rank grows"]) if e is not None]
     assert ranks[0] < ranks[-1] == len(cases["rank grows"][0].parameter_names)
 
 
 def test_the_order_of_coming_does_not_matter() -> None:
     robot, data = cell(20, 11, unknown=("base", "tool"))
     order = np.random.default_rng(2).permutation(20)
-    one = streamed(robot, data, {"sigma": SIGMA})[-1].estimate
-    other = streamed(robot, data.select(order), {"sigma": SIGMA})[-1].estimate
+    one = streamed(robot, data, {"sigma": SIGMA})[-1]
+    other = streamed(robot, data.select(order), {"sigma": SIGMA})[-1]
     assert one is not None and other is not None
     back = replace(
         other,
@@ -214,112 +221,27 @@ def test_the_order_of_coming_does_not_matter() -> None:
 def test_a_wrong_measurement_undone_leaves_no_trace() -> None:
     robot, data = cell(20, 12)
     before = streamed(robot, data, {"sigma": SIGMA})[-1]
-    wrong = before.with_configuration(data.q[0] + 0.3, data.p[5] + 0.4)
-    assert before.estimate is not None and wrong.estimate is not None
-    assert np.abs(wrong.estimate.values - before.estimate.values).max() > 1e-3
-    assert_same(wrong.without(wrong.newest).estimate, before.estimate)
+    assert before is not None
+    problem = IdentificationProblem(robot, data, SIGMA, **UPDATE)
+    more = Measurements(
+        data.joint_names, np.vstack([data.q, data.q[:1] + 0.3]), np.concatenate([data.p, data.p[5:6] + 0.4])
+    )
+    wrong = identify(replace(problem, data=more), before)
+    assert np.abs(wrong.values - before.values).max() > 1e-3
+    assert_same(identify(problem, wrong), before)
 
 
-def test_states_are_values() -> None:
-    robot, data = cell(14, 13, level="lengths+offsets")
-    states = streamed(robot, data, {"sigma": SIGMA})
-    undone = states[14].without(2).without(7)
-    again = undone.with_configuration(data.q[2], data.p[2])
-    assert states[14].ids == tuple(range(14))
-    assert undone.ids == tuple(i for i in range(14) if i not in (2, 7))
-    assert again.ids == (*undone.ids, 14) and again.newest == 14  # numbers are never given again
-    assert len(states[9]) == 9
-    assert_same(states[9].estimate, identify(replace(states[9].problem)))
-    with pytest.raises(AttributeError):
-        states[9].ids = ()  # type: ignore[misc]
-    assert states[9].data is not None
-    with pytest.raises(ValueError, match="read-only"):
-        states[9].data.q[0, 0] = 1.0
-    with pytest.raises(TypeError):
-        states[9].settings["sigma"] = 1.0  # type: ignore[index]
-
-
-def test_begins_from_the_last_estimate_and_only_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot, data = cell(20, 14, level="lengths+offsets")
-    starts: list[Estimate | None] = []
-
-    def counted(problem: IdentificationProblem, start: Estimate | None = None) -> Estimate:
-        starts.append(start)
-        return identify(problem, start)
-
-    monkeypatch.setattr(room, "identify", counted)
-    first = Accumulator.begin(robot, sigma=SIGMA).with_measurements(data.select(np.arange(18)))
-    assert starts == []
-    estimate = first.estimate
-    second = first.with_configuration(data.q[18], data.p[18]).with_configuration(data.q[19], data.p[19])
-    _ = second.estimate, second.estimate, first.estimate
-    assert [s is estimate for s in starts] == [False, True]
-
-
-def test_too_few_say_how_many() -> None:
-    robot, data = cell(4, 15, level="lengths+offsets", unknown=("base",))
-    empty = Accumulator.begin(robot, sigma=SIGMA)
-    assert empty.estimate is None and len(empty) == 0
-    assert isinstance(empty.shortfall, NotEnoughDataError)
-    assert (empty.shortfall.have, empty.shortfall.need) == (0, len(robot.parameter_names))
-    with pytest.raises(NotEnoughDataError):
-        _ = empty.problem
-    one = empty.with_configuration(data.q[0], data.p[0])
-    assert one.estimate is None and one.shortfall is not None and one.shortfall.have == 3
-    unseen = empty.with_configuration(data.q[0], np.full(3, np.nan))
-    assert unseen.estimate is None and unseen.shortfall is not None and unseen.shortfall.have == 0
-
-
-def test_a_file_at_once_and_then_one_by_one() -> None:
-    """Joints of the file in another order."""
+def test_joints_of_a_file_in_another_order() -> None:
     robot, data = cell(16, 16, level="lengths+offsets")
     turned = Measurements(data.joint_names[::-1], data.q[:, ::-1], data.p)
-    start = Accumulator.begin(robot, sigma=SIGMA).with_measurements(turned.select(np.arange(15)))
-    done = start.with_configuration(data.q[15], data.p[15])
-    assert done.ids == tuple(range(16))
-    assert_same(done.estimate, identify(IdentificationProblem(robot, data, SIGMA, **UPDATE)))
-
-
-def test_bad_input_is_refused() -> None:
-    robot, data = cell(3, 17, targets=2)
-    q, p = data.q[0], data.p[0]
-    empty = Accumulator.begin(robot)
-    some = empty.with_configuration(q, p)
-    half = p.copy()
-    half[1, 2] = np.nan
-    refused: list[tuple[str, Callable[[], object]]] = [
-        ("configuration", lambda: empty.with_configuration(q[:5], p)),
-        ("configuration", lambda: empty.with_configuration(data.q, p)),
-        ("configuration", lambda: empty.with_configuration(np.where(np.arange(6) == 2, np.nan, q), p)),
-        ("configuration", lambda: empty.with_configuration("north", p)),  # type: ignore[arg-type]
-        ("points", lambda: empty.with_configuration(q, p[0])),
-        ("points", lambda: empty.with_configuration(q, np.inf * p)),
-        ("points", lambda: empty.with_configuration(q, half)),
-        ("std", lambda: empty.with_configuration(q, p, [1e-5, 1e-5])),
-        ("std", lambda: empty.with_configuration(q, p, np.zeros((2, 3)))),
-        ("std", lambda: some.with_configuration(q, p, np.full((2, 3), 1e-5))),
-        ("std", lambda: empty.with_configuration(q, p, np.full((2, 3), 1e-5)).with_configuration(q, p)),
-        ("data", lambda: empty.with_measurements(cell(2)[1])),
-        ("number", lambda: some.without(1)),
-        ("number", lambda: some.without(0).without(0)),
-        ("settings", lambda: Accumulator.begin(robot, sigmas=1e-5)),
-        ("settings", lambda: Accumulator.begin(robot, data=data)),
-        ("sigma", lambda: Accumulator.begin(robot, sigma=-1e-5)),
-        ("loss", lambda: Accumulator.begin(robot, loss="huber")),
-    ]
-    for field, attempt in refused:
-        with pytest.raises(InputError) as caught:
-            attempt()
-        assert caught.value.field.startswith(field), str(caught.value)
-    with pytest.raises(UnknownNameError, match="did you mean 'sigma'"):
-        Accumulator.begin(robot, sigmas=1e-5)
+    update = identify(IdentificationProblem(robot, turned, SIGMA, **UPDATE))
+    assert_same(update, identify(IdentificationProblem(robot, data, SIGMA, **UPDATE)))
 
 
 def test_millimetres_are_refused_not_swallowed() -> None:
     robot, data = cell(8, 18, level="offsets")
-    wrong = Accumulator.begin(robot).with_measurements(replace(data, points=1e3 * data.p))
     with pytest.raises(InputError, match="millimetres"):
-        _ = wrong.estimate
+        identify(IdentificationProblem(robot, replace(data, points=1e3 * data.p), **UPDATE))
 
 
 def test_predicts_where_the_robot_really_is() -> None:
@@ -329,7 +251,7 @@ def test_predicts_where_the_robot_really_is() -> None:
     q = np.random.default_rng(3).uniform(low, high, (50, len(low)))
     real = robot.with_parameters("full")
     truth = real.with_deviations(random_deviations(real, 19, 5e-4, 1e-3)).positions(q)
-    estimate = streamed(robot, data, {"sigma": SIGMA, "test_poses": q})[-1].estimate
+    estimate = streamed(robot, data, {"sigma": SIGMA, "test_poses": q})[-1]
     assert estimate is not None
     error = np.linalg.norm(estimate.calibrated.positions(q) - truth, axis=2)
     assert np.sqrt(np.mean(error**2)) < 2 * estimate.predicted_accuracy < 1e-3
@@ -337,9 +259,9 @@ def test_predicts_where_the_robot_really_is() -> None:
 
 def test_what_is_left_to_the_end_changes_no_parameter() -> None:
     robot, data, settings = elastic()
-    accumulator = Accumulator.begin(robot, **settings).with_measurements(data)
-    update = accumulator.estimate
-    final = identify(replace(accumulator.problem, starts=2, joint_corrections="auto"), update)
-    assert update is not None and (update.starts, final.starts, final.agreeing_starts) == (0, 2, 2)
+    problem = IdentificationProblem(robot, data, **{**UPDATE, **settings})
+    update = identify(problem)
+    final = identify(replace(problem, starts=2, joint_corrections="auto"), update)
+    assert (update.starts, final.starts, final.agreeing_starts) == (0, 2, 2)
     np.testing.assert_allclose(update.values, final.values, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(update.std, final.std, rtol=0, atol=TOLERANCE)
