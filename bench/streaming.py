@@ -4,14 +4,15 @@
 
 A simulated KR-270 (0.5 mm, 1 mrad, 0.03 mm of noise), one target. ``full``: all 36 placement errors; ``full,
 base, tool``: the tracker's pose and the target unknown besides; ``paper``: lengths and joint offsets only, so
-that the other errors are a discrepancy, which is estimated as on a real robot. An update starts at the estimate of
-n − 1 configurations, adds one, and computes the whole new estimate, verdict included; medians over ``--updates`` of them with different configurations. ``cpu_ms`` is the processor's time,
-``least_ms`` the least of it: what the clock shows on an idle core. ``undo_ms`` withdraws a configuration from
-the middle instead. On any machine: ``jacobians`` is ``least_ms`` over that of one ``positions_and_jacobian`` of
-these configurations, ``whole`` the processor's time of all that ``identify`` does by default over ``cpu_ms``.
-``deviation`` is the largest absolute difference of any value, standard deviation [m | rad] or residual [m] from
-``identify`` of the same measurements without a start. Robust data have a gross error in every tenth point.
-``load`` is the machine's when the row was done.
+that the other errors are a discrepancy, which is estimated as on a real robot. An update starts at the estimate
+of n − 1 configurations, adds one, and computes the whole new estimate, verdict included; medians over
+``--updates`` of them with different configurations. ``cpu_ms`` is the processor's time, ``least_ms`` the least
+of it: what the clock shows on an idle core. ``undo_ms`` withdraws a configuration from the middle instead. On
+any machine: ``jacobians`` is ``least_ms`` over that of one ``positions_and_jacobian`` of these configurations,
+``whole`` the processor's time of all that ``identify`` does by default over ``cpu_ms``. ``deviation`` is the
+largest absolute difference of any value, standard deviation [m | rad] or residual [m] from ``identify`` of the
+same measurements without a start. Robust data have a gross error in every tenth point. ``load`` is the
+machine's when the row was done.
 """
 
 from __future__ import annotations
