@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import json
 import re
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,13 @@ ERRORS = 4.5
 
 @pytest.fixture(scope="module")
 def result() -> Reproduction:
+    """With three starts per search, not up to 48, which find nothing better where it is hardest, at pose C."""
     told: list[float] = []
-    made = reproduce(SETTINGS, lambda share, text: told.append(share))
+    module = sys.modules[reproduce.__module__]
+    poses = tuple(dataclasses.replace(pose, starts=3) for pose in module.TEST_POSES)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "TEST_POSES", poses)
+        made = reproduce(SETTINGS, lambda share, text: told.append(share))
     assert told == sorted(told) and told[0] >= 0 and told[-1] < 1
     return made
 
@@ -269,11 +275,8 @@ FILES = ["figure_2.png", "figure_2.svg", "figure_3.png", "figure_3.svg", "figure
 FILES += ["index.html", "tables.json"]
 
 
-def test_same_result_same_bytes(result: Reproduction, folder: Path, tmp_path: Path) -> None:
+def test_files(folder: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == FILES
-    publish(result, tmp_path)
-    for name in FILES:
-        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
     for name in FILES[:6:2]:
         data = (folder / name).read_bytes()
         assert data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 20_000
@@ -319,7 +322,7 @@ def test_the_page_stands_alone_and_says_what_the_tables_say(folder: Path, tables
 def test_command(
     result: Reproduction, folder: Path, tmp_path: Path, monkeypatch: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What the command adds to the library; the work itself is done once, above."""
+    """What the command adds to the library; the work itself is done once, above. Same result, same bytes."""
     command = importlib.import_module("calib_planner_paper.command")
     asked: list[ReproductionSettings] = []
 
@@ -334,7 +337,9 @@ def test_command(
     out = capsys.readouterr().out
     assert json.loads(out) == json.loads((folder / "tables.json").read_text(encoding="utf-8"))
     assert asked == [SETTINGS]
-    assert (tmp_path / "a" / "index.html").read_bytes() == (folder / "index.html").read_bytes()
+    for name in FILES:
+        assert (tmp_path / "a" / name).read_bytes() == (folder / name).read_bytes(), name
+    monkeypatch.setattr(sys.modules[publish.__module__], "publish", lambda *_: None)  # what is there already
     assert main(words) == 0
     shown = capsys.readouterr().out
     assert all(

@@ -23,6 +23,11 @@ def two_link(degrees=50.0, **changes):
     return PlanProblem(robot, q0, **settings)
 
 
+@pytest.fixture(scope="module")
+def planned():
+    return plan(problem())
+
+
 @pytest.mark.parametrize("accuracy", [0.9, 0.55, 0.3])
 def test_fewest_measurements_of_the_two_link_arm(accuracy):
     """Equation (20): n ≥ (1 + |sin q20|) / ρ²; the split found uses exactly that many."""
@@ -34,17 +39,17 @@ def test_fewest_measurements_of_the_two_link_arm(accuracy):
 
 def test_accuracy_with_an_error_that_repetition_does_not_average():
     """σ_c makes repetition worth less: more configurations, and still the accuracy asked for."""
-    plain = plan_for_accuracy(problem(), 12e-6).plan
-    rough = plan_for_accuracy(problem(configuration_sigma=2e-5), 12e-6).plan
-    assert plain.value <= 12e-6
-    assert rough.value <= 12e-6
+    plain = plan_for_accuracy(two_link(), 0.4).plan
+    rough = plan_for_accuracy(two_link(configuration_sigma=2 / 3), 0.4).plan
+    assert plain.value <= 0.4
+    assert rough.value <= 0.4
     assert rough.measurements > plain.measurements
     assert len(rough.configurations) >= len(plain.configurations)
 
 
 def test_accuracy_out_of_reach_is_said():
     with pytest.raises(InfeasibleError, match="not reached"):
-        plan_for_accuracy(problem(), 1e-9)
+        plan_for_accuracy(two_link(), 1e-9)
 
 
 def test_budget_prefers_few_configurations():
@@ -72,14 +77,13 @@ def test_only_criteria_in_metres():
         split_budget(problem(criterion="d"), 12)
 
 
-def test_value_of_given_configurations_is_the_plans():
-    found = plan(problem())
-    assert worth_of(problem(), found.configurations) == pytest.approx(found.value, rel=1e-6)
+def test_value_of_given_configurations_is_the_plans(planned):
+    assert worth_of(problem(), planned.configurations) == pytest.approx(planned.value, rel=1e-6)
 
 
-def test_repetition_is_as_good_as_measuring_again():
+def test_repetition_is_as_good_as_measuring_again(planned):
     """r repetitions with σ_c = 0 divide the variance by r; with σ_c they cannot go below it."""
-    q = plan(problem()).configurations
+    q = planned.configurations
     once = worth_of(problem(), q)
     assert worth_of(problem(repetitions=9), q) == pytest.approx(once / 3, rel=1e-9)
     rough = worth_of(problem(configuration_sigma=3e-5, repetitions=10_000), q)
@@ -103,26 +107,24 @@ def test_comparison():
         assert told["random"]["count"] == 500
 
 
-def test_idle_joints_rest():
+def test_idle_joints_rest(planned):
     """Joint 6 moves no target on its axis: it stays at the test pose's value."""
-    found = plan(problem())
-    assert (found.configurations[:, 5] == POSE[5]).all()
+    assert (planned.configurations[:, 5] == POSE[5]).all()
 
 
-def test_prior_and_measured_replace_measurements():
+def test_prior_and_measured_replace_measurements(planned):
     """What is known beforehand lets fewer configurations do, and never makes a plan worse."""
     from calib_planner.simulation import SimulatedCell
 
     robot = Robot.load("kuka_kr270")
-    first = plan(problem())
-    data = SimulatedCell(robot, {}, 3e-5).measure(first.configurations, 1, 0)
+    data = SimulatedCell(robot, {}, 3e-5).measure(planned.configurations, 1, 0)
     more = plan(problem(configurations=1, measured=data))
-    assert more.value < first.value
+    assert more.value < planned.value
     assert more.lower_bound <= more.value
-    rows = np.concatenate([first.configurations, more.configurations])
+    rows = np.concatenate([planned.configurations, more.configurations])
     assert more.value == pytest.approx(worth_of(problem(configurations=5), rows), rel=1e-6)
     known = plan(problem(prior_std={name: 1e-9 for name in robot.parameter_names if name != "q1"}))
-    assert known.value < first.value
+    assert known.value < planned.value
 
 
 def test_next_plan_needs_a_prior_for_what_it_cannot_identify_alone():
