@@ -228,9 +228,9 @@ def drive(
 
 def soak(chosen: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """The figures."""
-    seconds, domain = 60.0 * chosen.minutes, own_domain()
+    seconds = 60.0 * chosen.minutes
     q, points, names = prepare(chosen, folder / "store", int(seconds / chosen.period) + 2)
-    with Nodes(folder / "log", domain) as nodes:
+    with own_domain() as domain, Nodes(folder / "log", domain) as nodes:
         given = {"robot": ROBOT, "store_folder": f"'{folder / 'store'}'", "sigma": SIGMA}
         given |= {"parameters": chosen.parameters, "unknown": f"'{chosen.unknown}'"}
         nodes.start("identifier_node", given)

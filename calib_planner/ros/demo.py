@@ -82,8 +82,7 @@ def run_demo(options: Options, screen: Screen) -> DemoResult:
     Raises:
         CalibPlannerError: Says what failed, with the last lines of a node that ended.
     """
-    domain = own_domain()
-    with Nodes(options.folder / "log", domain) as nodes:
+    with own_domain() as domain, Nodes(options.folder / "log", domain) as nodes:
         screen.say("starting planner, identifier and simulated tracker")
         nodes.start("planner_node", {"robot": ROBOT})
         save = {"save_folder": f"'{options.folder.resolve()}'", "samples": SAMPLES, "sigma": SIGMA}

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionServer
+from rclpy.action import ActionClient, ActionServer
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
@@ -127,6 +127,19 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self._ending = True
         self._leave_all()
         return True
+
+    def destroy_node(self) -> None:
+        """As rclpy's, and what rclpy leaves to the garbage collector: state machine, action servers and clients.
+
+        Each of them keeps the node alive below Python. When the collector destroys it at last, it takes the entry
+        of its name in rcl's table of log publishers along. If that is the entry of another node of this name by
+        then, the other one works on, but nothing of what it logs is heard on ``/rosout`` any more.
+        """
+        for waitable in list(self.waitables):
+            if isinstance(waitable, (ActionServer, ActionClient)):
+                waitable.destroy()
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
 
     # ── transitions ──────────────────────────────────────────────────────────────────────────────────
 

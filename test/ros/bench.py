@@ -6,11 +6,10 @@ answer can be published before discovery has matched its reader.
 
 from __future__ import annotations
 
-import itertools
-import os
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import rclpy
@@ -24,15 +23,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.processes import own_domain
 from calib_planner.ros.run import spin_once
-
-_count = itertools.count(os.getpid() * 53)
-_worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-
-
-def next_domain() -> int:
-    """A ROS domain that nothing here used lately: nodes that were killed stay on the graph for a while."""
-    return 1 + 25 * (_worker % 4) + next(_count) % 25
 
 
 def overrides(values: Mapping[str, Any]) -> list[Parameter]:
@@ -41,7 +33,8 @@ def overrides(values: Mapping[str, Any]) -> list[Parameter]:
 
 class Bench:
     def __init__(self) -> None:
-        self.context, self.domain = Context(), next_domain()
+        self._kept = ExitStack()
+        self.context, self.domain = Context(), self._kept.enter_context(own_domain())
         rclpy.init(args=[], context=self.context, domain_id=self.domain)
         self.client = Node("test_client", context=self.context)
         self.nodes: list[Node] = []
@@ -86,6 +79,7 @@ class Bench:
         for node in (*self.nodes, self.client):
             node.destroy_node()
         rclpy.shutdown(context=self.context)
+        self._kept.close()
 
     def start(self, kind: Callable[..., Node], **parameters: Any) -> Any:
         """The node, spinning; one that starts by itself has done so, or has said why not in ``failure``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,17 +11,21 @@ import pytest
 from bench import Bench
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import GetAvailableTransitions, GetState
+from rcl_interfaces.msg import Log, ParameterValue
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner.errors import InputError
+from calib_planner.ros.campaign_node import CampaignNode
+from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
 from calib_planner.ros.parameters import parameter
-from calib_planner.ros.qos import LATCHED, SENSOR_IN
+from calib_planner.ros.planner_node import PlannerNode
+from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_IN
+from calib_planner.ros.simulator_node import SimulatorNode
 
 
 @dataclass(frozen=True)
@@ -213,3 +218,21 @@ def test_closing_ends_everything_once(bench: Bench) -> None:
     node = bench.start(Small)
     assert node.close() and node.close()
     assert node.log == ["configure", "activate", "deactivate", "clean_up", "undone"]
+
+
+@pytest.mark.parametrize("kind", [Small, PlannerNode, IdentifierNode, SimulatorNode, CampaignNode])
+def test_a_node_that_is_gone_does_not_silence_another_one_of_its_name(kind: type[ManagedNode[Any]]) -> None:
+    """What keeps a destroyed node alive is destroyed with it, not by the garbage collector later on."""
+    before = Bench()
+    with before:
+        before.start(kind)
+    with Bench() as bench:
+        node, logs = bench.start(kind), bench.hear(Log, "/rosout", EVENTS)
+        del before
+        gc.collect()
+
+        def heard() -> bool:
+            node.get_logger().warning("hello")  # until the reader is matched
+            return any((line.name, line.msg) == (node.get_name(), "hello") for line in logs)
+
+        bench.wait(heard)

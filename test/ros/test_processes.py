@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -11,22 +12,26 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bench import next_domain
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
 
+from calib_planner.errors import CalibPlannerError
 from calib_planner.ros import processes
-from calib_planner.ros.processes import Nodes, node_names
+from calib_planner.ros.processes import Nodes, node_names, own_domain
 
 PARENT = """
 import sys, time
 from pathlib import Path
 from calib_planner.ros import processes
-from calib_planner.ros.processes import Nodes
+from calib_planner.ros.processes import Nodes, own_domain
 
-nodes = Nodes(Path(sys.argv[1]), int(sys.argv[2]))
-for module in sys.argv[3:]:
-    nodes.start(module)
-print(*nodes.processes.values(), flush=True)
-time.sleep(600)
+with own_domain() as domain:
+    nodes = Nodes(Path(sys.argv[1]), domain)
+    for module in sys.argv[2:]:
+        nodes.start(module)
+    print(*nodes.processes.values(), flush=True)
+    time.sleep(600)
 """
 
 
@@ -48,7 +53,7 @@ def wait(condition: Callable[[], bool], seconds: float = 40.0) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes by /proc")
 def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     names = node_names()
-    command = [sys.executable, "-c", PARENT, str(tmp_path), str(next_domain()), *names]
+    command = [sys.executable, "-c", PARENT, str(tmp_path), *names]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         pids = [int(word) for word in parent.stdout.readline().split()]
@@ -68,7 +73,7 @@ def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
-    with Nodes(tmp_path, next_domain()) as nodes:
+    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         for name in node_names():
             nodes.start(name)
         logs = [tmp_path / f"{name}.log" for name in node_names()]
@@ -80,7 +85,7 @@ def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -
 
 
 def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
-    with Nodes(tmp_path, next_domain()) as nodes:
+    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         log = tmp_path / "simulator_node.log"
         for _ in range(2):
             nodes.start("simulator_node")
@@ -101,3 +106,22 @@ def test_a_module_that_is_none_is_refused() -> None:
 def test_all_nodes_are_named() -> None:
     here = Path(processes.__file__).parent
     assert sorted(node_names()) == sorted(path.stem for path in here.glob("*_node.py"))
+
+
+def test_a_domain_is_given_to_one_at_a_time_and_only_if_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def again() -> int:
+        monkeypatch.setattr(processes, "_domains", itertools.repeat(domain - 1))
+        with own_domain() as given:
+            return given
+
+    context = Context()
+    with own_domain() as domain:
+        with pytest.raises(CalibPlannerError, match="in use"):
+            again()
+        rclpy.init(args=[], context=context, domain_id=domain)
+        node = Node("inhabitant", context=context)
+    with pytest.raises(CalibPlannerError, match="in use"):
+        again()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+    assert again() == domain

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench import next_domain
 from calib_planner_msgs.msg import CalibrationEstimate
 from calib_planner_msgs.srv import PlanCalibration
 
@@ -19,15 +18,14 @@ from calib_planner import Robot
 from calib_planner.ros import demo
 from calib_planner.ros.conversions import estimate_from_message
 from calib_planner.ros.demo_client import DemoClient
-from calib_planner.ros.processes import Nodes, ProcessFailed
+from calib_planner.ros.processes import Nodes, ProcessFailed, own_domain
 from calib_planner.simulation import random_deviations
 
 SEED = 11
 
 
 def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
-    domain = next_domain()
-    with Nodes(tmp_path, domain) as nodes:
+    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 16})
         nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
         nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7})
@@ -64,8 +62,7 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
-    domain = next_domain()
-    with Nodes(tmp_path, domain) as nodes:
+    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 5000})
         client = DemoClient(domain, nodes.check)
         try:
@@ -88,8 +85,7 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
 
 
 def test_a_node_that_fails_is_reported(tmp_path: Path) -> None:
-    domain = next_domain()
-    with Nodes(tmp_path, domain) as nodes:
+    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"robt": "planar_2r"})
         client = DemoClient(domain, nodes.check)
         try:
