@@ -48,10 +48,10 @@ setup(
     entry_points={
         "console_scripts": [
             "calib-planner = calib_planner.cli:main",
-            "planner_node = calib_planner.ros.planner_node:main",
-            "identifier_node = calib_planner.ros.identifier_node:main",
-            "simulator_node = calib_planner.ros.simulator_node:main",
-            "campaign_node = calib_planner.ros.campaign_node:main",
+            "planner_node = calib_planner.ros.nodes.planner:main",
+            "identifier_node = calib_planner.ros.nodes.identifier:main",
+            "simulator_node = calib_planner.ros.nodes.simulator:main",
+            "campaign_node = calib_planner.ros.nodes.campaign:main",
         ],
     },
 )

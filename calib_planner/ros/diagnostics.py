@@ -14,8 +14,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from calib_planner.acquisition import Offset
 from calib_planner.identification import Estimate
 from calib_planner.io import UnavailableStore
-from calib_planner.ros.campaign import Campaign, condition_of
-from calib_planner.ros.conversions import stamp_message
+from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.session import Campaign, condition_of
 
 OK, WARN, ERROR, STALE = (
     DiagnosticStatus.OK,

@@ -34,9 +34,9 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from calib_planner.errors import CalibPlannerError, UnknownNameError
-from calib_planner.ros.lasting import LastingActionServer, lasting
 from calib_planner.ros.parameters import QOS, NodeParameters, parameter
 from calib_planner.ros.qos import REQUESTS, overridable, own
+from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 

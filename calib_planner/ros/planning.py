@@ -19,8 +19,8 @@ from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.io import config_folder, read_constraints
 from calib_planner.planning import Constraint, ModelDiscrepancy, Plan, PlanProblem, Progress, plan
 from calib_planner.robot import Robot
-from calib_planner.ros.conversions import check_rows
-from calib_planner.ros.model_source import Model, NotReady, shipped_model
+from calib_planner.ros.messages import check_rows
+from calib_planner.ros.model import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, unknown_words
 
 MOST_PARAMETERS = 1000

@@ -26,8 +26,8 @@ from calib_planner.acquisition import (
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InputError
 from calib_planner.io import LONGEST
-from calib_planner.ros.conversions import nanoseconds
 from calib_planner.ros.diagnostics import StreamHealth
+from calib_planner.ros.messages import nanoseconds
 
 
 class JointReader:

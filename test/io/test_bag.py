@@ -37,7 +37,7 @@ from calib_planner import IdentificationProblem, identify
 from calib_planner.acquisition import Rejection, Standstill, StandstillDetector, StandstillSettings
 from calib_planner.io import BagTopics, StoredModel, is_bag, open_store, read_bag
 from calib_planner.io.bag import storage_parts
-from calib_planner.ros.campaign import Campaign, Matching
+from calib_planner.ros.session import Campaign, Matching
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KINDS = [("SQLITE3", "NONE"), ("SQLITE3", "MESSAGE"), ("SQLITE3", "FILE")]

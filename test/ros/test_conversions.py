@@ -17,7 +17,7 @@ from calib_planner.acquisition import Reason, Rejection, Standstill
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification.estimate import STATUS as LIBRARY_ESTIMATE_STATUS
 from calib_planner.planning.plan import STATUS as LIBRARY_PLAN_STATUS
-from calib_planner.ros import conversions as c
+from calib_planner.ros import messages as c
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 

@@ -15,9 +15,9 @@ from calib_planner import Estimate
 from calib_planner.acquisition import NANO, Offset, StandstillSettings
 from calib_planner.errors import InputError, StoreError
 from calib_planner.io import StoredModel, UnavailableStore
-from calib_planner.ros.campaign import Campaign
-from calib_planner.ros.conversions import joints_message, point_message, stamp_message
 from calib_planner.ros.diagnostics import StreamHealth, diagnostics
+from calib_planner.ros.messages import joints_message, point_message, stamp_message
+from calib_planner.ros.session import Campaign
 from calib_planner.ros.streams import Intake, JointReader, StreamWatch
 
 GOOD = StreamHealth("joint_states", 1000.0, 0.002, 0.0, 5000, 0, 0, 0, "")

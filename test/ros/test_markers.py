@@ -15,8 +15,8 @@ from calib_planner.errors import InputError
 from calib_planner.io import config_folder
 from calib_planner.planning import Plan
 from calib_planner.ros.markers import MOST_SHOWN, plan_markers, skeletons
+from calib_planner.ros.messages import pace_of, trajectory_message
 from calib_planner.ros.settings import PlannerParameters
-from calib_planner.ros.trajectory import pace_of, trajectory_message
 
 STAMP = 1_500_000_000
 

@@ -12,8 +12,8 @@ from calib_planner import Estimate, Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import Standstill, StandstillDetector
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.io import CampaignStore, StoredModel, open_store
-from calib_planner.ros import saving
-from calib_planner.ros.campaign import Campaign, Matching, TooFew
+from calib_planner.ros import session as saving
+from calib_planner.ros.session import Campaign, Matching, TooFew
 from calib_planner.simulation import SimulatedCell, make_tour, random_deviations
 
 LIMITS = np.array([[-3.0, 3.0], [-3.0, 3.0]])

@@ -24,11 +24,11 @@ from sensor_msgs.msg import JointState
 
 from calib_planner.errors import CalibPlannerError, InputError
 from calib_planner.io import config_folder, read_instrument
-from calib_planner.ros.conversions import joints_message, plan_from_message, point_message
-from calib_planner.ros.execution import check_executable
+from calib_planner.ros.executor import check_executable
 from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.messages import joints_message, plan_from_message, point_message
 from calib_planner.ros.qos import SENSOR_OUT
-from calib_planner.ros.run import run
+from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import SimulatorParameters, load_shipped
 from calib_planner.simulation import (
     NANO,

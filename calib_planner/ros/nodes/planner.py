@@ -30,15 +30,14 @@ from visualization_msgs.msg import MarkerArray
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.planning import Progress
-from calib_planner.ros.conversions import plan_to_message
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.markers import plan_markers
-from calib_planner.ros.model_source import TOPIC, Model, ModelSource
+from calib_planner.ros.messages import pace_of, plan_to_message, trajectory_message
+from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.planning import Answer, answer, constraints_of
 from calib_planner.ros.qos import LATCHED
-from calib_planner.ros.run import run
+from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PlannerParameters
-from calib_planner.ros.trajectory import pace_of, trajectory_message
 
 FEEDBACK_PERIOD = 0.1
 """Shortest time between two feedback messages [s]."""

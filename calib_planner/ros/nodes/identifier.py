@@ -1,12 +1,4 @@
-"""Node ``calibration_identifier``: hears joints and tracker points, publishes the calibrated parameters.
-
-Standstills are found in ``streams``, matched to the plan, stored and identified in ``campaign``, saved in
-``saving``; this file only carries messages. All callbacks take turns in one thread: a standstill costs a commit
-to disk and an identification, some 20 ms together, for which the queues of the streams are deep enough by far.
-
-A measurement is acknowledged on ``~/measurements`` after it is on the disk. As long as that cannot be written,
-standstills are rejected as not stored and the node goes on; the next standstill tries again.
-"""
+"""What the identifier publishes: estimates, measurements, the calibrated URDF, diagnostics."""
 
 from __future__ import annotations
 
@@ -14,8 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import UndoMeasurement
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -28,20 +22,98 @@ from std_srvs.srv import Trigger
 from calib_planner import __version__
 from calib_planner.acquisition import Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
-from calib_planner.io import ACCEPTED, UnavailableStore, open_store
-from calib_planner.ros import saving
-from calib_planner.ros.campaign import Campaign, Matching
-from calib_planner.ros.conversions import ReceivedPlan, plan_from_message
+from calib_planner.identification import Estimate
+from calib_planner.io import ACCEPTED, Decision, UnavailableStore, calibrated_urdf, open_store
+from calib_planner.ros import session
 from calib_planner.ros.diagnostics import diagnostics
-from calib_planner.ros.identified_model import IdentifiedModel, first_model, heard_model
-from calib_planner.ros.identifier_output import IdentifierOutput
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.model_source import TOPIC
-from calib_planner.ros.polling import Stream, StreamPoller
-from calib_planner.ros.qos import LATCHED
-from calib_planner.ros.run import run
+from calib_planner.ros.messages import (
+    ESTIMATE_STATUS,
+    ReceivedPlan,
+    estimate_to_message,
+    measurement_message,
+    plan_from_message,
+    stamp_message,
+)
+from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
+from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
+from calib_planner.ros.rclpy_ext.run import run
+from calib_planner.ros.session import Campaign, Matching, TooFew, condition_of
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.ros.streams import Intake
+
+
+class IdentifierOutput:
+    """The publishers of the identifier; made in ``configure``."""
+
+    def __init__(self, node: ManagedNode[IdentifierParameters]) -> None:
+        self._log = node.get_logger
+        self._estimates = node.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
+        self._descriptions = node.create_publisher(String, "~/robot_description", LATCHED)
+        self._measurements = node.create_publisher(Measurement, "~/measurements", EVENTS)
+        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
+
+    def decision(self, campaign: Campaign, decision: Decision) -> None:
+        """What became of a standstill."""
+        message = measurement_message(
+            decision.found,
+            campaign.nominal.joint_names,
+            decision.frame or "tracker",
+            status=decision.status,
+            reason=decision.reason,
+            plan_id=campaign.plan_id if decision.index is not None else "",
+            index=decision.index,
+            repetition=decision.repetition,
+            number=decision.number,
+            unused=decision.unused,
+        )
+        self._measurements.publish(message)
+        self._log().info(f"configuration {decision.index}: {decision.status} {decision.reason}".rstrip())
+
+    def estimate(self, campaign: Campaign, found: Estimate | TooFew) -> None:
+        """What the campaign says now."""
+        others = {
+            "plan_id": campaign.plan_id,
+            "configurations": len(campaign.done()),
+            "rejected": campaign.rejections.total(),
+            "complete": campaign.complete,
+        }
+        if isinstance(found, Estimate):
+            message = estimate_to_message(found, condition=condition_of(found), **others)
+        else:
+            message = CalibrationEstimate(
+                robot=campaign.robot.name,
+                measurements=sum(int((d.standstill.samples > 0).sum()) for d in campaign.accepted),
+                condition=float("nan"),
+                status=ESTIMATE_STATUS["too_few" if found.missing else "error"],
+                message=found.message,
+                **others,
+            )
+            if not found.missing:
+                self._log().error(found.message)
+        message.header.stamp = stamp_message(campaign.kept[-1].found.stop if campaign.kept else 0)
+        self._estimates.publish(message)
+
+    def description(self, urdf: str, found: Estimate | TooFew) -> None:
+        """The calibrated URDF, or the nominal one ``urdf`` as long as there is no estimate; nothing without."""
+        if urdf and isinstance(found, Estimate):
+            urdf = calibrated_urdf(urdf, found.calibrated, TOPIC)[0]
+        if urdf:
+            self._descriptions.publish(String(data=urdf))
+
+    def diagnostics(self, message: DiagnosticArray) -> None:
+        """How it goes."""
+        self._diagnostics.publish(message)
+
+
+# ── Node ``calibration_identifier``: hears joints and tracker points, publishes the calibrated parameters ───
+# Standstills are found in ``streams``, matched to the plan, stored and identified in ``campaign``, saved in
+# ``saving``; this file only carries messages. All callbacks take turns in one thread: a standstill costs a commit
+# to disk and an identification, some 20 ms together, for which the queues of the streams are deep enough by far.
+#
+# A measurement is acknowledged on ``~/measurements`` after it is on the disk. As long as that cannot be written,
+# standstills are rejected as not stored and the node goes on; the next standstill tries again.
 
 JOINTS = "joint_states"
 
@@ -355,10 +427,10 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
 
     def _save(self, campaign: Campaign) -> str:
         urdf = "" if self._model is None else self._model.urdf
-        return "saved " + ", ".join(map(str, saving.save(self._folder, campaign, self._how, urdf)))
+        return "saved " + ", ".join(map(str, session.save(self._folder, campaign, self._how, urdf)))
 
     def _report(self, campaign: Campaign) -> str:
-        return f"report written to {saving.report(self._folder, campaign, self._how)}"
+        return f"report written to {session.report(self._folder, campaign, self._how)}"
 
 
 def main(args: Sequence[str] | None = None) -> int:

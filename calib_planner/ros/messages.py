@@ -11,17 +11,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Duration, Time
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from geometry_msgs.msg import Point, PointStamped, Vector3
 from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_planner.acquisition import NANO, Reason, Rejection, Standstill, pick_joints
 from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
-from calib_planner.planning import Plan
+from calib_planner.planning import Pace, Plan, timetable
+from calib_planner.robot import Robot
 
 MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""
@@ -323,3 +325,40 @@ def estimate_from_message(message: CalibrationEstimate) -> ReceivedEstimate:
     accuracy = check_array("predicted_accuracy", message.predicted_accuracy, (None,), finite=False)
     sigma = float(message.sigma)
     return ReceivedEstimate(names, nominal, deviation, std, accuracy, sigma, float(message.sigma_estimate))
+
+
+# ── A plan as a trajectory for a controller: slow enough, also on the unknown way to its first stop ─────────
+
+
+def pace_of(robot: Robot, turning: float, sliding: float, limits: FloatArray, dwell: float) -> Pace:
+    """Joint speeds: ``turning`` [rad/s] or ``sliding`` [m/s], and never above ``limits`` (joints,)."""
+    wanted = np.where(robot.joint_is_revolute, turning, sliding)
+    return Pace(np.minimum(wanted, limits), dwell, "of the node's parameters and the robot description")
+
+
+def trajectory_message(plan: Plan, robot: Robot, pace: Pace, stamp: int, frame_id: str) -> JointTrajectory:
+    """Arrival at and departure from every stop, at rest; only the arrival if nobody stands there.
+
+    Args:
+        plan: Its configurations [rad | m], in the order of visiting.
+        robot: Its limits bound the way to the first stop, which begins nobody knows where.
+        pace: Speeds and standstill.
+        stamp: Of the header [ns].
+        frame_id: Of the header.
+
+    Raises:
+        InputError: The tour is longer than a ROS duration can say.
+    """
+    times = timetable(plan, robot, pace)
+    result = JointTrajectory(joint_names=list(plan.joint_names))
+    result.header.stamp, result.header.frame_id = stamp_message(stamp), frame_id
+    for q, arrive, leave in zip(plan.configurations.tolist(), times.arrive, times.leave, strict=True):
+        result.points += [_point(q, t) for t in ((arrive, leave) if pace.dwell > 0 else (arrive,))]
+    return result
+
+
+def _point(positions: list[float], seconds: float) -> JointTrajectoryPoint:
+    after = round(float(seconds) * NANO)
+    point = JointTrajectoryPoint(positions=positions, velocities=[0.0] * len(positions))
+    point.time_from_start = Duration(sec=after // NANO, nanosec=after % NANO)
+    return point

@@ -40,15 +40,20 @@ from calib_planner.campaign import (
 )
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.io import Journal, begin_journal, open_journal
-from calib_planner.ros.campaign_measuring import Measuring
-from calib_planner.ros.campaign_request import problem_of
-from calib_planner.ros.campaign_results import reasons_of, result_message, write_result
-from calib_planner.ros.campaign_status import idle_status, status_message
-from calib_planner.ros.conversions import stamp_message
+from calib_planner.ros.campaign import (
+    Measuring,
+    idle_status,
+    problem_of,
+    reasons_of,
+    result_message,
+    status_message,
+    write_result,
+)
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.model_source import TOPIC, Model, ModelSource
+from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.qos import EVENTS, LATCHED
-from calib_planner.ros.run import run
+from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import CampaignParameters
 
 PERIOD = 0.05

@@ -1,9 +1,4 @@
-"""One ``ExecutePlan`` goal at a time, with an end whatever the robot's side does.
-
-A goal ends with the robot's result, or *lost*: nothing was heard of it (no answer, no feedback) for ``silence``
-seconds. What is lost may be running all the same; it is cancelled under the name that we gave it, as soon as
-anybody listens. Everything here is called in the thread of the executor.
-"""
+"""Which plans a robot can execute: the same for the simulated one and for the adapter of a real one."""
 
 from __future__ import annotations
 
@@ -12,12 +7,46 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from action_msgs.srv import CancelGoal
 from calib_planner_msgs.action import ExecutePlan
 from rclpy.action import ActionClient
 from unique_identifier_msgs.msg import UUID
 
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
+
+MOST_STANDSTILLS = 100_000
+"""Standstills of one plan; at a second each that is more than a day."""
+
+
+def check_executable(plan: Plan, robot: Robot) -> None:
+    """Refuse a plan that this robot cannot execute.
+
+    Raises:
+        InputError: Other robot or joints, a configuration outside the limits, or standstills without end.
+    """
+    if plan.robot != robot.name:
+        raise UnknownNameError("plan.robot", plan.robot, [robot.name])
+    if plan.joint_names != robot.joint_names:
+        raise InputError("plan.joint_names", ", ".join(plan.joint_names), ", ".join(robot.joint_names))
+    if plan.measurements > MOST_STANDSTILLS:
+        expected = f"at most {MOST_STANDSTILLS}"
+        raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
+    low, high = robot.joint_limits.T
+    outside = (plan.configurations < low - 1e-6) | (plan.configurations > high + 1e-6)
+    if outside.any():
+        i, j = (int(k) for k in np.argwhere(outside)[0])
+        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
+        raise InputError(f"plan.configurations, row {i}", f"{plan.configurations[i, j]:.4f}", expected)
+
+
+# ── One ``ExecutePlan`` goal at a time, with an end whatever the robot's side does ──────────────────────────
+# A goal ends with the robot's result, or *lost*: nothing was heard of it (no answer, no feedback) for ``silence``
+# seconds. What is lost may be running all the same; it is cancelled under the name that we gave it, as soon as
+# anybody listens. Everything here is called in the thread of the executor.
 
 RESULTS = {
     ExecutePlan.Result.SUCCESS: "done",
