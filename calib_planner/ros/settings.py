@@ -372,7 +372,7 @@ def yaml_text(name: str) -> str:
     kind, node = NODES[name]
     lines = [
         f"# Parameters of the node {node} ({name}_node): every one there is, at its default.",
-        f"# Use: python -m calib_planner.ros.{name}_node --ros-args --params-file config/{name}.yaml",
+        f"# Use: python -m calib_planner.ros.nodes.{name} --ros-args --params-file config/{name}.yaml",
         "/**:",
         "  ros__parameters:",
     ]
