@@ -43,7 +43,7 @@ from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification import Estimate, typical_prior
 from calib_planner.io import read_measurements, write_measurements
 from calib_planner.measurements import Measurements
-from calib_planner.robot.elements import rotation
+from calib_planner.robot import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,7 +12,7 @@ from calib_planner.campaign.findings import OPEN, Finding, different, forecast, 
 from calib_planner.campaign.problem import AwayFrom, distances
 from calib_planner.campaign.state import FIT, CampaignState, Decision, Stop
 from calib_planner.errors import InfeasibleError
-from calib_planner.identification.estimate import FEWEST_SPARE
+from calib_planner.identification import FEWEST_SPARE
 from calib_planner.planning import Feasibility, PlanProblem, plan, plan_space, smallest_size, visiting_order
 
 REPEATED = 4

@@ -9,8 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.cli.arguments import Commands, add_command, add_seed
-from calib_planner.cli.terminal import Terminal
+from calib_planner.cli import Commands, Terminal, add_command, add_seed
 from calib_planner_paper import printed
 from calib_planner_paper.page import micrometres
 from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, reproduce
