@@ -28,6 +28,7 @@ from calib_planner.acquisition.clocks import ClockOffsets
 from calib_planner.acquisition.stamps import StampOrder
 from calib_planner.arrays import FloatArray, IntArray, check_array, check_count, check_number, frozen
 from calib_planner.errors import InputError
+from calib_planner.units import length, milliseconds
 
 NANO = 1_000_000_000
 IN_A_ROW = 50
@@ -184,9 +185,9 @@ class StandstillDetector:
         for k in range(self.target_count):
             offset = self.clocks.offset(k)
             if offset is not None and offset.exceeds(bound):
-                text = f"target {k + 1} is stamped {1e3 * offset.seconds:+.0f} ms from the joints"
+                text = f"target {k + 1} is stamped {milliseconds(offset.seconds, plus=True)} from the joints"
                 by = f"by when both stopped and started at {offset.standstills} standstills"
-                return f"{text}, {by}, {1e3 * bound:.0f} ms are allowed: synchronise the clocks"
+                return f"{text}, {by}, {milliseconds(bound)} are allowed: synchronise the clocks"
         return ""
 
     def misdated(self, bound: float) -> list[tuple[int, int]]:
@@ -333,7 +334,7 @@ class StandstillDetector:
         moved = [w.moved_by for w in self._targets]
         if max(moved) > 0:
             k = int(np.argmax(moved))
-            text = f"target {k + 1} moved by {1e3 * moved[k]:.3f} mm while the joints stood still"
+            text = f"target {k + 1} moved by {length(moved[k])} while the joints stood still"
             return Reason.MOVED, f"{text}: wait until nothing vibrates, or raise point_tolerance"
         if self._saw_nan:
             return Reason.NOT_FINITE, "values are not finite: check line of sight and the drivers"

@@ -48,14 +48,13 @@ from calib_planner.identification import (
     Estimate,
     Reason,
     Verdict,
-    counted,
-    mm,
     normalised,
     validate,
 )
 from calib_planner.measurements import Measurements
 from calib_planner.planning import Feasibility
 from calib_planner.tracker import Noise
+from calib_planner.units import counted, length
 
 
 def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) -> Decision:
@@ -224,8 +223,8 @@ def without_estimate(outcome: str, message: str) -> Verdict:
 def _predicted(estimate: Estimate, required: float) -> Reason:
     worst = float(np.max(estimate.predicted_accuracy_per_test_pose))
     level = "PASS" if worst <= required else "FAIL"
-    said = mm(worst) if np.isfinite(worst) else "nothing"
-    text = f"predicted at the worst test pose: {said} where {mm(required)} are required"
+    said = length(worst) if np.isfinite(worst) else "nothing"
+    text = f"predicted at the worst test pose: {said} where {length(required)} are required"
     return Reason(
         level, "required_accuracy", text, "" if level == "PASS" else "the outcome says what stands in the way"
     )
@@ -238,7 +237,7 @@ def _achieved(estimate: Estimate, required: float, data: Measurements) -> Reason
     error = float(np.sqrt(max(square - noise * (1.0 + 2.0 * np.sqrt(2.0 / (3.0 * len(residuals)))), 0.0)))
     level = "PASS" if error <= required else "FAIL"
     points, rms, tracker = counted(len(residuals), "point"), float(np.sqrt(square)), float(np.sqrt(noise))
-    text = f"achieved at the test poses, {points}: {mm(rms)} with the tracker's noise of {mm(tracker)}"
-    text += f", {mm(required)} required"
+    text = f"achieved at the test poses, {points}: {length(rms)} with the tracker's noise of {length(tracker)}"
+    text += f", {length(required)} required"
     advice = "" if level == "PASS" else "something differs there: load, temperature, approach, the target's seat"
     return Reason(level, "achieved_at_test_poses", text, advice)

@@ -40,6 +40,7 @@ from calib_planner.identification import (
 from calib_planner.measurements import Measurements
 from calib_planner.planning import ModelDiscrepancy
 from calib_planner.tracker import Isotropic, Noise
+from calib_planner.units import cut, length
 
 ENOUGH = 30
 """Degrees of freedom of repetitions that tell noise from discrepancy: a ratio of variances of 3 is then seen."""
@@ -191,17 +192,20 @@ def found_in(state: CampaignState) -> Finding | None:
 
 def outcome_of(state: CampaignState, found: Finding | None) -> tuple[str, str]:
     """A key of ``OUTCOMES`` and why; empty: go on."""
-    problem = state.problem
+    problem, required = state.problem, f"{length(state.problem.required_accuracy)} required"
     if found is not None and ready(state, found) and found.accuracy <= problem.required_accuracy:
-        return "reached", f"{_mm(found.accuracy)} predicted, {_mm(problem.required_accuracy)} required"
+        return "reached", f"{length(found.accuracy)} predicted, {required}"
     if state.given_up > problem.most_failures:
         reasons = sorted({e.reason for e in state.exclusions if not e.asked})
-        return "unreachable", f"{state.given_up} configurations given up: {'; '.join(reasons)[:300]}"
+        return "unreachable", f"{state.given_up} configurations given up: {cut('; '.join(reasons), 300)}"
     if state.spent(FIT) >= problem.fit_budget:
-        now = "nothing identified" if found is None else f"{_mm(found.accuracy)} predicted"
-        return "budget_spent", f"{now}, {_mm(problem.required_accuracy)} required{_forecast_text(state, found)}"
+        now = "nothing identified" if found is None else f"{length(found.accuracy)} predicted"
+        return (
+            "budget_spent",
+            f"{now}, {required}{_forecast_text(state, found)}",
+        )
     if found is not None and ready(state, found) and limited(state, found):
-        text = f"{_mm(found.floor)} at a test pose are the robot's own, {_mm(problem.required_accuracy)} required"
+        text = f"{length(found.floor)} at a test pose are the robot's own, {required}"
         return "limited", text
     return "", ""
 
@@ -260,7 +264,3 @@ def round_of(state: CampaignState, found: Finding | None, planned: int, note: st
         planned,
         note,
     )
-
-
-def _mm(metres: float) -> str:
-    return "unlimited" if not np.isfinite(metres) else f"{1e3 * metres:.4g} mm"

@@ -42,13 +42,13 @@ from calib_planner.cli.arguments import (
 from calib_planner.cli.terminal import Terminal
 from calib_planner.demo import independent_seeds
 from calib_planner.errors import InputError
-from calib_planner.identification import AUTOMATIC, counted, mm
+from calib_planner.identification import AUTOMATIC
 from calib_planner.io import read_measurements, write_configurations, write_estimate, write_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.planning import plain
 from calib_planner.robot import Robot
 from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations, simulated
-from calib_planner.units import length
+from calib_planner.units import counted, length
 
 DESCRIPTION = """Plan a batch, measure it, identify, plan the rest from what was measured, until the accuracy is
 reached, the budget is spent, or more measurements cannot help; then validate on configurations that took no part.
@@ -212,7 +212,7 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
     with terminal.progress("measuring") as update:
 
         def watch(state: CampaignState) -> None:
-            accuracy = f", {mm(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
+            accuracy = f", {length(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
             update(state.spent() / problem.budget, f"{len(state.of_role(FIT))} measured{accuracy}")
 
         result = run_campaign(problem, simulated(world, noise_seed), watch)

@@ -9,8 +9,6 @@ from calib_planner.identification.estimate import (
     Reason,
     Validation,
     Verdict,
-    counted,
-    mm,
 )
 from calib_planner.identification.evidence import fit_placement
 from calib_planner.identification.least_squares import SAME_JOINT, configuration_labels

@@ -21,6 +21,7 @@ from calib_planner.identification.noise_levels import FEWEST_SPARE, NoiseLevels
 from calib_planner.identification.transmission import Transmission
 from calib_planner.planning import plain
 from calib_planner.robot import Robot
+from calib_planner.units import counted, length, listed, milliradians
 
 LEVELS = ("PASS", "WARN", "FAIL")
 
@@ -95,10 +96,10 @@ def _solution(e: Estimate) -> Iterator[Reason]:
         )
     after = e.residual_after
     if after.rms > LARGEST_RESIDUAL:
-        text = f"{mm(after.rms)} are left after the fit: more than any robot's geometry explains"
+        text = f"{length(after.rms)} are left after the fit: more than any robot's geometry explains"
         yield Reason("FAIL", "large_residuals", text, "check joint order, signs, units, and which point is whose")
     elif after.mean > 0.9 * e.residual_before.mean:
-        text = f"the fit improved the points from {mm(e.residual_before.mean)} to {mm(after.mean)} only"
+        text = f"the fit improved the points from {length(e.residual_before.mean)} to {length(after.mean)} only"
         yield Reason("WARN", "no_gain", text, "these parameters are not what ails the robot: free others")
 
 
@@ -125,7 +126,7 @@ def _rejections(e: Estimate) -> Iterator[Reason]:
             level, "rejected", text, "each is listed with its reason; measure those configurations again"
         )
     if e.suspects:
-        rows = ", ".join(str(s["row"]) for s in e.suspects[:5]) + (" …" if len(e.suspects) > 5 else "")
+        rows = listed([s["row"] for s in e.suspects], 5)
         number = counted(len(e.suspects), "point")
         text = f"{number} beyond {e.gate:.3g} standard deviations (rows {rows}), used nevertheless"
         yield Reason("WARN", "suspects", text, "look at them, or use the robust loss (--loss robust)")
@@ -138,17 +139,18 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
         yield Reason("WARN", "repeatability", text, "check the robot's standstill, the nest and the tracker")
     if noise.discrepancy > 0:
         text = (
-            f"{mm(noise.discrepancy)} per coordinate is left that measurement noise ({mm(noise.measurement)}) "
-            "does not explain: no geometric model holds it, and measuring more often does not reduce it"
+            f"{length(noise.discrepancy)} per coordinate is left that measurement noise "
+            f"({length(noise.measurement)}) does not explain: no geometric model holds it, and measuring more "
+            "often does not reduce it"
         )
         yield Reason("PASS", "model_discrepancy", text, "it is part of every accuracy predicted here")
         return
-    probability = e.chi_square.probability
+    probability, stated = e.chi_square.probability, length(noise.measurement)
     if probability < 1e-3:
-        text = f"measurement noise of {mm(noise.measurement)} explains such residuals in {probability:.1g} only"
+        text = f"measurement noise of {stated} explains such residuals in {probability:.1g} only"
         yield Reason("WARN", "poor_fit", text, "free more parameters, look for gross errors, check sigma")
     elif probability > 1.0 - 1e-6:
-        text = f"the residuals scatter {mm(e.sigma_estimate)}, far less than the {mm(noise.measurement)} stated"
+        text = f"the residuals scatter {length(e.sigma_estimate)}, far less than the {stated} stated"
         yield Reason("WARN", "noise_overstated", text, "the standard deviations are too large: check sigma")
 
 
@@ -167,7 +169,7 @@ def _order(e: Estimate) -> Iterator[Reason]:
         far = float(np.linalg.norm(found.translation))
         sign = f"by chance {found.probability:.1g}" if not found.instead else "noise explains the rest"
         text = (
-            f"{who}{words[found.kind]}{when}, it seems, by {mm(far)} ({sign}); "
+            f"{who}{words[found.kind]}{when}, it seems, by {length(far)} ({sign}); "
             f"{found.parameter} may be off by {found.shift:.2g} standard deviations"
         )
         yield Reason(
@@ -180,7 +182,7 @@ def _order(e: Estimate) -> Iterator[Reason]:
 
 def _structure(e: Estimate) -> Iterator[Reason]:
     if e.transmission is not None:
-        size = f"{1e3 * e.transmission.amplitude:.2g} mrad, alike over {e.transmission.length:g} rad"
+        size = f"{milliradians(e.transmission.amplitude)}, alike over {e.transmission.length:g} rad"
         text = f"the joints' transmissions err ({size}): corrections were learnt and are part of every prediction"
         advice = "a URDF cannot hold them: apply them to the joint targets (calib-planner compensate)"
         yield Reason("PASS", "joint_corrections", text, advice)
@@ -210,14 +212,14 @@ def _local(e: Estimate) -> Iterator[Reason]:
     worst = int(np.argmax(shifts))
     if not shifts[worst] > FAR:
         return
-    size = f"{1e3 * e.hidden.amplitude:.2g} mrad"
+    size = milliradians(e.hidden.amplitude)
     text = (
         f"joints that err by {size} would hardly show in these data, but move {e.parameters[worst]} by "
         f"{shifts[worst]:.2g} standard deviations: the values hold round the measured postures only"
     )
     there = _unpromised(e)
     if there.any():
-        off = mm(float(e.hidden.at_test_poses[there].max()))
+        off = length(float(e.hidden.at_test_poses[there].max()))
         text = f"{text}; predictions at {there.sum()} of {len(there)} test poses may be off by {off} more"
         yield Reason("WARN", "local", text, "measure round the test poses too, or wherever the robot works")
     else:
@@ -240,7 +242,7 @@ def _unpromised(e: Estimate) -> NDArray[np.bool_]:
 
 def _parameters(e: Estimate) -> Iterator[Reason]:
     if e.held:
-        text = f"{counted(len(e.held), 'parameter')} held, not to be told from others: {listed(e.held)}"
+        text = f"{counted(len(e.held), 'parameter')} held, not to be told from others: {listed(e.held, 4)}"
         yield Reason("PASS", "unidentifiable", text, "no measured point depends on the choice")
     if e.nearly_dependent:
         number = counted(len(e.nearly_dependent), "combination")
@@ -266,11 +268,11 @@ def _accuracy(e: Estimate) -> Iterator[Reason]:
     worst = float(per.max()) if len(per) else 0.0
     if len(per) and not np.isnan(worst):
         level = "PASS" if worst <= required else "FAIL"
-        text = f"predicted at the test poses: {mm(worst)} where {mm(required)} are required"
+        text = f"predicted at the test poses: {length(worst)} where {length(required)} are required"
         advice = "" if level == "PASS" else _advice(e)
         yield Reason(level, "required_accuracy", text, advice)
     elif not len(per) and e.validation is None and e.cross_validation is None:
-        text = f"{mm(required)} are required, but nothing says where"
+        text = f"{length(required)} are required, but nothing says where"
         yield Reason("WARN", "required_accuracy", text, "give test poses, or data to validate with")
 
 
@@ -295,12 +297,12 @@ def _held_out(e: Estimate) -> Iterator[Reason]:
 
 def _validation(v: Validation, what: str, required: float) -> Iterator[Reason]:
     if v.mean >= v.before_mean:
-        text = f"{what} are no better than before: {mm(v.mean)}, before {mm(v.before_mean)}"
+        text = f"{what} are no better than before: {length(v.mean)}, before {length(v.before_mean)}"
         yield Reason("FAIL", "no_gain_held_out", text, "do not apply it: free fewer parameters or measure more")
     ratio = v.rms / v.predicted_rms
     if np.isfinite(ratio):
         level = "FAIL" if ratio > APART[1] else "WARN" if ratio > APART[0] else "PASS"
-        text = f"{what}: {mm(v.rms)} achieved where {mm(v.predicted_rms)} were predicted"
+        text = f"{what}: {length(v.rms)} achieved where {length(v.predicted_rms)} were predicted"
         advice = "" if level == "PASS" else "they lie elsewhere than what was measured, or the robot changed"
         yield Reason(level, "predicted_and_achieved", text, advice)
     if v.count >= MANY and v.within_95 < INSIDE:
@@ -313,26 +315,10 @@ def _validation(v: Validation, what: str, required: float) -> Iterator[Reason]:
         # What is required is the robot's; what was achieved holds the measurement's noise as well.
         level = "PASS" if v.robot_rms <= required else "FAIL"
         advice = "" if level == "PASS" else "free more parameters, measure more, or calibrate closer to the task"
-        noise = (
-            f"of it {mm(v.noise_rms)} the measurement's" if v.noise_rms > 0 else "the measurement's part included"
-        )
-        text = f"{what}: {mm(v.rms)} achieved, {noise}, where {mm(required)} are required"
+        known = v.noise_rms > 0
+        noise = f"of it {length(v.noise_rms)} the measurement's" if known else "the measurement's part included"
+        text = f"{what}: {length(v.rms)} achieved, {noise}, where {length(required)} are required"
         yield Reason(level, "required_accuracy", text, advice)
-
-
-def mm(metres: float) -> str:
-    """A length for people."""
-    return f"{1e3 * metres:.3g} mm"
-
-
-def counted(number: int, noun: str) -> str:
-    """A number with its noun."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def listed(names: tuple[str, ...], most: int = 4) -> str:
-    """The first few names."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 # ── The answer of the identification: parameters, how sure they are, and what the residuals say ─────────────

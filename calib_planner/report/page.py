@@ -135,11 +135,11 @@ def rounded(value: float, style: str) -> str:
     if style == "milli":
         return signed(1e3 * value, 4)
     if style == "change":
-        return ("+" if round(1e3 * value, 4) > 0 else "") + signed(1e3 * value, 4)
+        return signed(1e3 * value, 4, plus=True)
     if style == "percent":
         return f"{100 * value:.0f} %"
     if style == "correlation":
-        return ("+" if value > 0 else "") + signed(value, 3)
+        return signed(value, 3, plus=True)
     if style == "short":
         return (f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.3g}").replace("-", "−")
     if style == "count":

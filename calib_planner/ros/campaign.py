@@ -35,6 +35,7 @@ from calib_planner.ros.model import Model, NotReady
 from calib_planner.ros.planning import constraints_of
 from calib_planner.ros.session import confined
 from calib_planner.ros.settings import CampaignParameters, unknown_words, with_topics
+from calib_planner.units import cut, listed
 
 SAME = ("budget", "batch", "validation", "minimum", "attempts", "most_failures", "exclusion", "sigma", "starts",
         "time_limit", "seed")  # fmt: skip
@@ -243,7 +244,7 @@ class Measuring:
         known = any(r.number == message.id for r in state.rows)
         if message.status not in (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER):
             if known:
-                return state.withdrawn(int(message.id), message.reason[:300] or "undone")
+                return state.withdrawn(int(message.id), cut(message.reason, 300) or "undone")
             self._rejected(message)
             return state
         self._spoilt = ""
@@ -258,7 +259,7 @@ class Measuring:
         visit = self.visit
         if visit is None or visit.phase not in ("moving", "judging"):
             return
-        visit.said, visit.anywhere = message.reason[:300], message.status in ANYWHERE
+        visit.said, visit.anywhere = cut(message.reason, 300), message.status in ANYWHERE
         # Points tell a standstill that was rejected from one that was none, and may become one yet.
         plan, row = self._plans.get(message.plan_id), message.configuration_index
         here = plan is not None and row < len(plan.stops) and plan.stops[row] == visit.action.index
@@ -374,7 +375,7 @@ def _joints(message: Measurement, state: CampaignState) -> FloatArray:
     """Where the robot stood, in its own order of joints."""
     names = state.problem.robot.joint_names
     if sorted(message.joint_names) != sorted(names):
-        raise InputError("measurement.joint_names", ", ".join(message.joint_names)[:200], ", ".join(names))
+        raise InputError("measurement.joint_names", listed(message.joint_names), ", ".join(names))
     return pick_joints(message.joint_names, message.joint_positions, names)
 
 
@@ -427,7 +428,7 @@ def idle_status(reason: str) -> CampaignStatus:
     numbers = dict.fromkeys(
         ("predicted_accuracy", "required_accuracy", "sigma", "validation_rms", "validation_predicted"), NAN
     )
-    return CampaignStatus(state=CampaignStatus.IDLE, reason=reason[:1000], **numbers)
+    return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **numbers)
 
 
 def status_message(state: CampaignState, campaign_id: str, waiting: str, reason: str) -> CampaignStatus:
@@ -460,7 +461,7 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
         round_measured=[r.measured for r in state.rounds],
         round_accuracy=[r.accuracy for r in state.rounds],
         joint_names=list(problem.robot.joint_names),
-        reason="; ".join(filter(None, (waiting, reason, state.message)))[:1000],
+        reason=cut("; ".join(filter(None, (waiting, reason, state.message)))),
     )
     if isinstance(action, Measure):
         message.configuration_index, message.configuration = action.index, action.q.tolist()

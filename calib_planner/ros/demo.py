@@ -39,6 +39,7 @@ from calib_planner.ros.messages import estimate_from_message, plan_from_message
 from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
+from calib_planner.units import length
 
 ATTEMPT = 8.0
 """Seconds after which an unanswered call is repeated."""
@@ -316,7 +317,7 @@ def _error(client: DemoClient) -> str:
     accuracy = np.asarray(client.estimate.predicted_accuracy) if client.estimate else np.empty(0)
     if not accuracy.size:
         return ""
-    return f", error at the test pose now {1e3 * accuracy[0]:.4f} mm (1 std)"
+    return f", error at the test pose now {length(accuracy[0])} (1 std)"
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -17,6 +17,7 @@ from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.units import cut
 
 MOST_STANDSTILLS = 100_000
 """Standstills of one plan; at a second each that is more than a day."""
@@ -142,7 +143,7 @@ class PlanExecution:
             return
         result = future.result().result
         how = RESULTS.get(result.status, "aborted")
-        self._ended = Ended(how, str(result.message)[:500])
+        self._ended = Ended(how, cut(result.message, 500))
 
     def _cancel(self, name: UUID) -> None:
         request = CancelGoal.Request()

@@ -24,6 +24,7 @@ from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
 from calib_planner.planning import Pace, Plan, timetable
 from calib_planner.robot import Robot
+from calib_planner.units import brief
 
 MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""
@@ -124,13 +125,13 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
     """
     joints = tuple(message.joint_names)
     if not joints or len(set(joints)) != len(joints):
-        raise InputError("joint_names", list(joints)[:10], "at least one name, each once")
+        raise InputError("joint_names", brief(list(joints)), "at least one name, each once")
     q = check_rows("configurations", message.configurations, joints)
     poses = check_rows("test_poses", message.test_poses, joints, least=0)
     counts = np.asarray(message.repetitions, np.int64)
     if counts.shape != (len(q),) or (counts < 1).any() or (counts > MOST_REPETITIONS).any():
         expected = f"{len(q)} numbers from 1 to {MOST_REPETITIONS}, one per configuration"
-        raise InputError("repetitions", counts.tolist()[:10], expected)
+        raise InputError("repetitions", brief(counts.tolist()), expected)
     names = {v: k for k, v in PLAN_STATUS.items()}
     status = names.get(message.status, "")
     if status in ("", "empty", "infeasible"):

@@ -27,6 +27,7 @@ from calib_planner.ros.settings import (
     unknown_words,
     with_topics,
 )
+from calib_planner.units import brief, cut
 
 TOPIC = "robot_description"
 LONGEST_TEXT = 4_000_000
@@ -87,7 +88,7 @@ def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model
         raise FileFormatError(TOPIC, "chain", got, f"at most {MOST_MOVING}", advice)
     for name in (robot.name, *robot.joint_names):
         if len(name) > LONGEST_NAME or not name.isprintable():
-            raise FileFormatError(TOPIC, "name", ascii(name[:40]), f"at most {LONGEST_NAME} printable characters")
+            raise FileFormatError(TOPIC, "name", brief(name, 40), f"at most {LONGEST_NAME} printable characters")
     speeds = parse_speed_limits(text, TOPIC, robot.joint_names)
     return Model(robot, _no_limits(robot) if speeds is None else speeds, described=True)
 
@@ -139,7 +140,7 @@ class ModelSource:
         try:
             found = described_model(text, self._settings.base_link, self._settings.tip_link)
         except CalibPlannerError as error:
-            self.refusal = f"{TOPIC} refused: {str(error)[:800]}"
+            self.refusal = f"{TOPIC} refused: {cut(error, 800)}"
             if isinstance(self._found, Model):
                 self.refusal += f"; {self._found.robot.name} stays the robot"
             else:

@@ -42,6 +42,7 @@ from calib_planner.measurements import Measurements
 from calib_planner.planning import Plan
 from calib_planner.report import InputFile, Provenance, write_report
 from calib_planner.robot import Robot
+from calib_planner.units import brief, cut, listed
 
 MOST_REJECTIONS = 10_000
 """Rejected standstills of a campaign that are written; more are only counted: nobody shall fill the disk."""
@@ -116,9 +117,9 @@ class Campaign:
             InputError: The plan is for another robot, or another plan has its name.
         """
         if plan.robot != self.nominal.name:
-            raise UnknownNameError("plan.robot", plan.robot[:100], [self.nominal.name])
+            raise UnknownNameError("plan.robot", cut(plan.robot, 100), [self.nominal.name])
         if plan.joint_names != self.nominal.joint_names:
-            got = ", ".join(plan.joint_names)[:200]
+            got = listed(plan.joint_names)
             raise InputError("plan.joint_names", got, ", ".join(self.nominal.joint_names))
         self.follow(plan)
         known = self.store.find(plan_id, plan)
@@ -448,7 +449,7 @@ def confined(folder: str, name: str) -> Path:
         raise InputError(FIELD, got, "a folder that can be written to", "choose another folder") from None
     path = target / name
     if Path(name).name != name or name in ("", ".", "..") or "\0" in name or path.is_symlink():
-        raise InputError(FIELD, ascii(str(path))[:200], "a file in this folder itself", "move the link away")
+        raise InputError(FIELD, brief(str(path), 200), "a file in this folder itself", "move the link away")
     return path
 
 

@@ -16,6 +16,7 @@ from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import LifecycleParameters
 from calib_planner.ros.parameters import constraints_text, parameter
 from calib_planner.simulation import Faults
+from calib_planner.units import cut
 
 ROBOT = "shipped robot name"
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas"
@@ -67,7 +68,7 @@ class PlannerParameters(LifecycleParameters):
     def __post_init__(self) -> None:
         for word in unknown_words(self.unknown):
             if word not in ("base", "tool"):
-                raise UnknownNameError("unknown", word[:100], ("base", "tool"))
+                raise UnknownNameError("unknown", cut(word, 100), ("base", "tool"))
 
 
 @dataclass(frozen=True)
@@ -304,7 +305,7 @@ class CampaignParameters(LifecycleParameters):
     def __post_init__(self) -> None:
         for word in unknown_words(self.unknown):
             if word not in ("base", "tool"):
-                raise UnknownNameError("unknown", word[:100], ("base", "tool"))
+                raise UnknownNameError("unknown", cut(word, 100), ("base", "tool"))
         if self.budget <= self.validation:
             raise InputError("budget", self.budget, f"more than validation, which is {self.validation}")
         _ = self.test_pose_rows
@@ -319,7 +320,8 @@ class CampaignParameters(LifecycleParameters):
             except ValueError:
                 row = (float("nan"),)
             if not np.isfinite(row).all():
-                raise InputError("test_poses", text[:100], "numbers with spaces between, poses with semicolons")
+                expected = "numbers with spaces between, poses with semicolons"
+                raise InputError("test_poses", cut(text, 100), expected)
             rows.append(row)
         return tuple(rows)
 

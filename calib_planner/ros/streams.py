@@ -28,6 +28,7 @@ from calib_planner.errors import InputError
 from calib_planner.io import LONGEST
 from calib_planner.ros.diagnostics import StreamHealth
 from calib_planner.ros.messages import nanoseconds
+from calib_planner.units import brief
 
 
 class JointReader:
@@ -159,7 +160,7 @@ class Intake:
         if not watch.usable(stamp) or self.detector is None:
             return []
         if frame and frame != self.frame and not self._enter_frame(frame[:LONGEST]):
-            other = f"frame_id {frame[:40]!r}, the points before are in {self.frame[:40]!r}"
+            other = f"frame_id {brief(frame, 40)}, the points before are in {brief(self.frame, 40)}"
             self._other_frame[target] = f"{other}: publish all in one frame, or call ~/reset"
             watch.refuse(self._other_frame[target])
             return []

@@ -55,6 +55,7 @@ from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import CampaignParameters
+from calib_planner.units import cut
 
 PERIOD = 0.05
 """Time between two looks at what there is to do [s]."""
@@ -160,7 +161,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
                 raise InputError("node", self.state, "active", "activate it")
             response.message, response.success = action(), True
         except CalibPlannerError as error:
-            response.message, response.success = str(error)[:1000], False
+            response.message, response.success = cut(error), False
         self._publish_status()
         return response
 
@@ -233,7 +234,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         try:
             self._set(self._measuring.heard(message, state))
         except InputError as error:
-            self.get_logger().warning(f"measurement refused: {str(error)[:500]}", throttle_duration_sec=1.0)
+            self.get_logger().warning(f"measurement refused: {cut(error, 500)}", throttle_duration_sec=1.0)
 
     # ── the campaign goes on ─────────────────────────────────────────────────────────────────────────
 
@@ -290,7 +291,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self.get_logger().info(f"round {len(self.campaign.rounds)}: {decision.message}")
 
     def _pause_for(self, reason: str) -> None:
-        self._reason = f"paused: {reason[:800]}"
+        self._reason = f"paused: {cut(reason, 800)}"
         self.get_logger().error(self._reason)
         if self.campaign is not None:
             self._set(self.campaign.pause())

@@ -42,6 +42,7 @@ from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.session import Campaign, Matching, TooFew, condition_of
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.ros.streams import Intake
+from calib_planner.units import brief, cut
 
 
 class IdentifierOutput:
@@ -197,7 +198,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             self._intake.use(model.robot.joint_names)
         self._keep_frame()
         if self._campaign.kept:
-            text = f"campaign of plan {self._campaign.plan_id[:40]!r} goes on"
+            text = f"campaign of plan {brief(self._campaign.plan_id, 40)} goes on"
             self.get_logger().info(f"{text}: {len(self._campaign.kept)} measurements are in {store.path}")
 
     def _keep_frame(self) -> None:
@@ -222,8 +223,8 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             heard = heard_model(message.data, self.settings.value)
             self._replace_campaign(heard)
         except CalibPlannerError as error:
-            self.get_logger().error(f"{TOPIC} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
-            self._waiting = f"{TOPIC} refused: {str(error)[:800]}"
+            self.get_logger().error(f"{TOPIC} refused: {cut(error)}", throttle_duration_sec=1.0)
+            self._waiting = f"{TOPIC} refused: {cut(error, 800)}"
             return
         self.get_logger().info(f"{TOPIC}: {heard.robot.name}, joints {', '.join(heard.robot.joint_names)}")
 
@@ -260,14 +261,14 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         except CalibPlannerError as error:
             self._refuse_plan(received.plan_id, error)
             return
-        name = f"plan {received.plan_id[:40]!r}"
+        name = f"plan {brief(received.plan_id, 40)}"
         text = f"{name}: {received.plan.measurements} measurements, {len(campaign.kept)} of them there"
         self.get_logger().info(f"{text}; {before} were there of the plan before" if before else text)
         self._keep_frame()
         self._update()
 
     def _refuse_plan(self, plan_id: str, error: CalibPlannerError) -> None:
-        self.get_logger().error(f"plan {plan_id[:40]!r} refused: {str(error)[:1000]}", throttle_duration_sec=1.0)
+        self.get_logger().error(f"plan {brief(plan_id, 40)} refused: {cut(error)}", throttle_duration_sec=1.0)
 
     def _on_joints(self, message: JointState) -> None:
         if self._intake is None:
@@ -275,7 +276,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         try:
             results = self._intake.joints(message)
         except InputError as error:
-            self.get_logger().warning(f"{JOINTS}: {str(error)[:1000]}", throttle_duration_sec=5.0)
+            self.get_logger().warning(f"{JOINTS}: {cut(error)}", throttle_duration_sec=5.0)
             return
         if results:
             self._handle(results)
@@ -374,7 +375,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         try:
             response.message, response.success = action(self._working()), True
         except CalibPlannerError as error:
-            response.message, response.success = str(error)[:1000], False
+            response.message, response.success = cut(error), False
         return response
 
     def _working(self) -> Campaign:
@@ -416,9 +417,9 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             response.id, response.message = self._withdraw(campaign, request.id)
             response.status = kind.SUCCESS
         except StoreError as error:
-            response.status, response.message = kind.NOT_STORED, str(error)[:1000]
+            response.status, response.message = kind.NOT_STORED, cut(error)
         except InputError as error:
-            response.status, response.message = kind.UNKNOWN_ID, str(error)[:1000]
+            response.status, response.message = kind.UNKNOWN_ID, cut(error)
         return response
 
     @property

@@ -38,6 +38,7 @@ from calib_planner.ros.planning import Answer, answer, constraints_of
 from calib_planner.ros.qos import LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PlannerParameters
+from calib_planner.units import cut
 
 FEEDBACK_PERIOD = 0.1
 """Shortest time between two feedback messages [s]."""
@@ -165,7 +166,7 @@ class PlannerNode(ManagedNode[PlannerParameters]):
             if result.plan is not None and self._source.refusal and not request.robot:
                 result = replace(result, message=f"{result.message}; {self._source.refusal}")
         except Exception as error:
-            result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {str(error)[:1000]}")
+            result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {cut(error)}")
         if self.context.ok():
             text = f"{result.status} after {time.perf_counter() - began:.2f} s: {result.message}"
             if result.status == "INTERNAL_ERROR":

@@ -41,6 +41,7 @@ from calib_planner.simulation import (
     make_tour,
     random_deviations,
 )
+from calib_planner.units import cut
 
 FEEDBACK_PERIOD = 0.1
 """Time between two looks at the execution [s]."""
@@ -146,7 +147,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             return self._execute(goal, result)
         except CalibPlannerError as error:
             goal.abort()
-            result.status, result.message = ExecutePlan.Result.INVALID_PLAN, str(error)[:1000]
+            result.status, result.message = ExecutePlan.Result.INVALID_PLAN, cut(error)
             self.get_logger().warning(f"plan refused: {result.message}")
             return result
         except Exception as error:
