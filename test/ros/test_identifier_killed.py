@@ -35,7 +35,7 @@ TRUE = ROBOT.with_deviations(random_deviations(ROBOT, 6))
 PLAN = plan_of(ROBOT, random_configurations(ROBOT, 8, 5))
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 AVERAGED = 40
-"""Points that the identifier averages: 0.4 s of 100 Hz; the mean's noise is what it takes it for, and no outlier."""
+"""Points that the identifier averages, 0.4 s of 100 Hz: its mean has the noise that it is taken for."""
 
 
 class Feeder:
