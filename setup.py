@@ -5,6 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "calib_planner"
+PAPER = "calib_planner_paper"
 SHARE = f"share/{NAME}"
 
 
@@ -26,8 +27,9 @@ setup(
     maintainer_email="calib-planner@example.com",
     license="Apache-2.0",
     python_requires=">=3.10",
-    packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "report/templates/*.*"]},
+    packages=[*find_packages(include=[NAME, f"{NAME}.*"]), PAPER],
+    package_dir={PAPER: f"paper/{PAPER}"},
+    package_data={NAME: ["py.typed", "report/templates/*.*"], PAPER: ["reproduction.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
@@ -46,10 +48,10 @@ setup(
     entry_points={
         "console_scripts": [
             "calib-planner = calib_planner.cli:main",
-            "planner_node = calib_planner.ros.planner_node:main",
-            "identifier_node = calib_planner.ros.identifier_node:main",
-            "simulator_node = calib_planner.ros.simulator_node:main",
-            "campaign_node = calib_planner.ros.campaign_node:main",
+            "planner_node = calib_planner.ros.nodes.planner:main",
+            "identifier_node = calib_planner.ros.nodes.identifier:main",
+            "simulator_node = calib_planner.ros.nodes.simulator:main",
+            "campaign_node = calib_planner.ros.nodes.campaign:main",
         ],
     },
 )

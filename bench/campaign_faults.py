@@ -42,10 +42,10 @@ from std_srvs.srv import Trigger
 
 from calib_planner import Robot
 from calib_planner.errors import CalibPlannerError
-from calib_planner.files.campaign_schema import FILE as STORE
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.ros.conversions import estimate_from_message
-from calib_planner.ros.demo_client import DemoClient
+from calib_planner.io import read_measurements
+from calib_planner.io.store import FILE as STORE
+from calib_planner.ros.demo import DemoClient
+from calib_planner.ros.messages import estimate_from_message
 from calib_planner.ros.processes import Nodes
 from calib_planner.ros.qos import LATCHED
 from calib_planner.simulation import Faults, random_deviations

@@ -45,8 +45,8 @@ from simulated_cells import SIGMA, Case, Cell, cell_of, spoil, true_deviations
 
 from calib_planner import IdentificationProblem, identify, validate
 from calib_planner.errors import NotEnoughDataError
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
+from calib_planner.identification import Estimate
+from calib_planner.measurements import Measurements
 
 SECTIONS = {"coverage": 1.0, "outliers": 0.4, "breakdown": 0.1, "noise": 0.4}
 """Share of the seeds that each takes."""

@@ -31,12 +31,11 @@ from typing import Any
 import numpy as np
 
 from calib_planner import IdentificationProblem, Measurements, PlanProblem, Robot, identify, plan
-from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.design.identifiability import analyse
+from calib_planner.acquisition import Rejection, Standstill, StandstillDetector, mean_std
+from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import CalibPlannerError
-from calib_planner.identification.estimate import Estimate
-from calib_planner.instrument.standstill import Rejection, Standstill, StandstillDetector
-from calib_planner.instrument.standstill_noise import mean_std
+from calib_planner.identification import Estimate
+from calib_planner.robot import analyse
 from calib_planner.simulation import Faults, SimulatedCell, World, make_tour, play, random_deviations
 
 SIGMA = 3e-5

@@ -38,13 +38,12 @@ from typing import Any
 import numpy as np
 
 from calib_planner import IdentificationProblem, Robot, identify
-from calib_planner._arrays import FloatArray
+from calib_planner.arrays import FloatArray
 from calib_planner.errors import NotEnoughDataError
-from calib_planner.files.measurements_csv import read_measurements, write_measurements
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.prior import typical_prior
-from calib_planner.robot.elements import rotation
+from calib_planner.identification import Estimate, typical_prior
+from calib_planner.io import read_measurements, write_measurements
+from calib_planner.measurements import Measurements
+from calib_planner.robot import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 ROOT = Path(__file__).resolve().parents[1]

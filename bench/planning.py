@@ -14,8 +14,7 @@ import time
 import numpy as np
 
 from calib_planner import PlanProblem, Robot, plan
-from calib_planner.design.information import InformationModel
-from calib_planner.design.space import plan_space
+from calib_planner.planning import InformationModel, plan_space
 
 TARGETS = {3: 0.94, 4: 0.985, 6: 0.99, 12: 0.99}
 """Configurations: smallest efficiency wanted."""

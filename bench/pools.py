@@ -26,15 +26,14 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot
-from calib_planner._arrays import FloatArray
-from calib_planner.design.criteria import Determinant
-from calib_planner.design.identifiability import analyse
-from calib_planner.design.planner import plan
-from calib_planner.design.pool_bound import relax_pool
-from calib_planner.design.problem import PlanProblem
-from calib_planner.design.search.exchange import PoolProblem, choose
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.identification.solver import start_robot
+from calib_planner.arrays import FloatArray
+from calib_planner.identification import start_robot
+from calib_planner.io import read_measurements
+from calib_planner.planning import PlanProblem, plan
+from calib_planner.planning.bound import relax_pool
+from calib_planner.planning.criteria import Determinant
+from calib_planner.planning.search.exchange import PoolProblem, choose
+from calib_planner.robot import analyse
 
 COUNTS = (10, 20, 30)
 ROOT = Path(__file__).resolve().parents[1]

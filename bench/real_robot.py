@@ -23,14 +23,12 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot
-from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.design.discrepancy import ModelDiscrepancy
-from calib_planner.design.planner import plan
-from calib_planner.design.problem import PlanProblem
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.solver import start_robot
-from calib_planner.instrument.noise import Isotropic
+from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.identification import start_robot
+from calib_planner.io import read_measurements
+from calib_planner.measurements import Measurements
+from calib_planner.planning import ModelDiscrepancy, PlanProblem, plan
+from calib_planner.tracker import Isotropic
 
 COUNTS = (10, 15, 20, 30)
 SIGMA = 1.5e-5

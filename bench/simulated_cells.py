@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_planner import IdentificationProblem, Robot
-from calib_planner._arrays import FloatArray
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.prior import Prior
-from calib_planner.identification.solver import start_robot
-from calib_planner.robot.elements import rotation
+from calib_planner.arrays import FloatArray
+from calib_planner.identification import Estimate, Prior, start_robot
+from calib_planner.measurements import Measurements
+from calib_planner.robot import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 SIGMA, LENGTH, ANGLE = 3e-5, 5e-4, 1e-3

@@ -47,13 +47,13 @@ from rich.table import Table
 from sensor_msgs.msg import JointState
 
 from calib_planner import PlanProblem, Robot, __version__, plan
-from calib_planner.files.campaign_store import open_store
-from calib_planner.instrument.standstill import NANO, Standstill
-from calib_planner.ros.campaign import Campaign, Matching
-from calib_planner.ros.conversions import stamp_message
-from calib_planner.ros.identified_model import first_model
+from calib_planner.acquisition import NANO, Standstill
+from calib_planner.io import open_store
+from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.model import first_model
 from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.session import Campaign, Matching
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.simulation import random_deviations
 

@@ -4,15 +4,15 @@
 
 A simulated KR-270 (0.5 mm, 1 mrad, 0.03 mm of noise), one target. ``full``: all 36 placement errors; ``full,
 base, tool``: the tracker's pose and the target unknown besides; ``paper``: lengths and joint offsets only, so
-that the other errors are a discrepancy, which is estimated as on a real robot. An update takes an accumulator of
-n − 1 configurations, whose estimate is there, adds one and asks for everything of the new estimate, verdict
-included; medians over ``--updates`` of them with different configurations. ``cpu_ms`` is the processor's time,
-``least_ms`` the least of it: what the clock shows on an idle core. ``undo_ms`` withdraws a configuration from
-the middle instead. On any machine: ``jacobians`` is ``least_ms`` over that of one ``positions_and_jacobian`` of
-these configurations, ``whole`` the processor's time of all that ``identify`` does by default over ``cpu_ms``.
-``deviation`` is the largest absolute difference of any value, standard deviation [m | rad] or residual [m] from
-``identify`` of the same measurements without a start. Robust data have a gross error in every tenth point.
-``load`` is the machine's when the row was done.
+that the other errors are a discrepancy, which is estimated as on a real robot. An update starts at the estimate
+of n − 1 configurations, adds one, and computes the whole new estimate, verdict included; medians over
+``--updates`` of them with different configurations. ``cpu_ms`` is the processor's time, ``least_ms`` the least
+of it: what the clock shows on an idle core. ``undo_ms`` withdraws a configuration from the middle instead. On
+any machine: ``jacobians`` is ``least_ms`` over that of one ``positions_and_jacobian`` of these configurations,
+``whole`` the processor's time of all that ``identify`` does by default over ``cpu_ms``. ``deviation`` is the
+largest absolute difference of any value, standard deviation [m | rad] or residual [m] from ``identify`` of the
+same measurements without a start. Robust data have a gross error in every tenth point. ``load`` is the
+machine's when the row was done.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot, identify
-from calib_planner.identification.accumulator import Accumulator
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
+from calib_planner.identification import UPDATE, Estimate, IdentificationProblem
+from calib_planner.measurements import Measurements
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 SIGMA, LENGTH, ANGLE = 3e-5, 5e-4, 1e-3
@@ -58,11 +57,10 @@ def simulate(count: int, loss: str) -> tuple[Robot, Measurements]:
     return robot, replace(data, points=points, std=None)
 
 
-def timed(job: Callable[[], Accumulator]) -> tuple[Estimate, float, float]:
+def timed(job: Callable[[], Estimate]) -> tuple[Estimate, float, float]:
     """The estimate, verdict included, and milliseconds by the clock and of the processor."""
     clock, used = time.perf_counter(), time.process_time()
-    estimate = job().estimate
-    assert estimate is not None
+    estimate = job()
     _ = estimate.verdict
     return estimate, 1e3 * (time.perf_counter() - clock), 1e3 * (time.process_time() - used)
 
@@ -85,20 +83,22 @@ def deviation(one: Estimate, other: Estimate) -> float:
 
 def measure(robot: Robot, data: Measurements, count: int, loss: str, updates: int) -> dict[str, Any]:
     """One row of the table."""
-    begin = Accumulator.begin(robot, sigma=SIGMA, loss=loss)
-    before = begin.with_measurements(data.select(np.arange(count - 1)))
-    _ = before.estimate
+    settings = {**UPDATE, "sigma": SIGMA, "loss": loss}
+    problem = IdentificationProblem(robot, data.select(np.arange(count - 1)), **settings)
+    before = identify(problem)
     rows: list[tuple[float, float]] = []
-    problem, moved = before.problem, np.full(len(robot.parameter_names), 1e-4)
+    moved = np.full(len(robot.parameter_names), 1e-4)
     jacobian = min(processor(lambda: robot.positions_and_jacobian(problem.data.q, moved)) for _ in range(20))
     undone, apart = [], []
     for k in range(count - 1, count - 1 + updates):
-        after = before.with_configuration(data.q[k], data.p[k])
-        estimate, *times = timed(lambda after=after: after)
+        chosen = np.append(np.arange(count - 1), k)
+        after = replace(problem, data=data.select(chosen))
+        estimate, *times = timed(lambda after=after: identify(after, before))
         rows.append((times[0], times[1]))
-        undone.append(timed(lambda after=after: after.without(after.ids[count // 2]))[1])
+        less = replace(problem, data=data.select(np.delete(chosen, count // 2)))
+        undone.append(timed(lambda less=less, estimate=estimate: identify(less, estimate))[1])
         if len(apart) < 3:
-            apart.append(deviation(estimate, identify(after.problem)))
+            apart.append(deviation(estimate, identify(after)))
     asked = {"starts": 2, "joint_corrections": "auto", "order_check": "auto"}
     whole = processor(lambda: identify(replace(problem, **asked)).verdict)
     least, usual = min(r[1] for r in rows), median(r[1] for r in rows)

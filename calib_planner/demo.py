@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-from calib_planner.design.planner import Progress, plan
-from calib_planner.design.problem import PlanProblem
+from calib_planner.arrays import FloatArray
 from calib_planner.errors import InputError
-from calib_planner.files.estimate_yaml import write_estimate
-from calib_planner.files.measurements_csv import write_measurements
-from calib_planner.files.plan_yaml import write_plan
-from calib_planner.files.text import write_text
-from calib_planner.identification.problem import IdentificationProblem
-from calib_planner.identification.solver import identify
-from calib_planner.report.calibration_report import write_report
-from calib_planner.report.demo_report import RANDOM_PLANS, DemoResult, demo_report, draw
-from calib_planner.report.provenance import provenance
-from calib_planner.robot.chain import Robot
+from calib_planner.identification import IdentificationProblem, identify
+from calib_planner.io import write_estimate, write_measurements, write_plan, write_text
+from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, error_variance, plain, plan
+from calib_planner.report import provenance, write_report
+from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations
 
+RANDOM_PLANS = 100
+"""Random plans that stand for chance: one alone may be lucky."""
 ROBOT = "kuka_kr270"
 TEST_POSE = tuple(np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0]))
 """Upper arm leaning forward, forearm level, wrist bent [rad]."""
@@ -114,3 +113,254 @@ def _make(folder: str | Path) -> Path:
         reason = f"{folder} ({error.strerror})"
         raise InputError("output", reason, "a folder that can be made", "choose another") from None
     return path
+
+
+# ── What a demonstration ends with: truth beside estimate, before beside after, planned beside random ───────
+# ``demo_report`` needs the hidden truth, so it works in simulation only. The comparison with chance is made by
+# the library, not over ROS: random plans of the same size, the same true robot, the same noise, fresh draws.
+
+
+SHOWN_UNIT = {"m": "mm", "rad": "mrad"}
+"""Units of tables and pictures; both are 1000 times the SI value."""
+
+
+class IdentifiedParameters(Protocol):
+    """What is needed of an estimate; ``Estimate`` has it.
+
+    Attributes:
+        parameters: P names.
+        deviations: (P,) identified − nominal [m | rad].
+        std: (P,) standard deviations [m | rad], NaN where not identified.
+    """
+
+    @property
+    def parameters(self) -> tuple[str, ...]: ...
+    @property
+    def deviations(self) -> FloatArray: ...
+    @property
+    def std(self) -> FloatArray: ...
+
+
+@dataclass(frozen=True)
+class DemoParameter:
+    """One parameter, all numbers in its unit.
+
+    Attributes:
+        name, unit: Name; ``m`` or ``rad``.
+        nominal: What the controller believes.
+        true: What the simulated robot has.
+        value: What was identified.
+        std: Standard deviation of ``value``.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    true: float
+    value: float
+    std: float
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What was achieved, beside what was predicted.
+
+    Attributes:
+        robot: Name of the robot.
+        configurations, measurements: Size of the plan.
+        sigma: Standard deviation of one measured coordinate [m].
+        before, after: Position error at the test poses, root mean square over them [m].
+        predicted_accuracy: ρ0 of the plan, eq. (14) [m].
+        random_after: As ``after``, root mean square over ``random_plans`` random plans of equal size [m].
+        random_predicted_accuracy: As ``predicted_accuracy``, likewise [m].
+        random_plans: Number of random plans.
+        parameters: Parameter by parameter.
+        report: Folder with the files.
+    """
+
+    robot: str
+    configurations: int
+    measurements: int
+    sigma: float
+    before: float
+    after: float
+    predicted_accuracy: float
+    random_after: float
+    random_predicted_accuracy: float
+    random_plans: int
+    parameters: tuple[DemoParameter, ...]
+    report: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
+        result: dict[str, Any] = plain(asdict(self))
+        return result
+
+
+def demo_report(
+    problem: PlanProblem,
+    plan: Plan,
+    estimate: IdentifiedParameters,
+    truth: Mapping[str, float],
+    *,
+    seed: int = 0,
+    random_plans: int = RANDOM_PLANS,
+    report: str | Path = "",
+) -> DemoResult:
+    """Compare an estimate with the truth, and the plan with random ones.
+
+    Args:
+        problem: What was planned; its ``sigma`` is the noise of the random comparison.
+        plan: What was measured.
+        estimate: What was identified.
+        truth: True deviation of each parameter [m | rad].
+        seed: Of the random plans and their noise.
+        report: Folder named in the result.
+    """
+    robot, poses = problem.robot, problem.test_pose_array
+    cell = SimulatedCell(robot, truth, problem.sigma)
+    found = dict(zip(estimate.parameters, map(float, estimate.deviations), strict=True))
+    std = dict(zip(estimate.parameters, map(float, estimate.std), strict=True))
+    missing = [p.name for p in robot.parameters if p.name not in found]
+    if missing:
+        raise InputError("estimate", f"no {', '.join(missing)}", "all parameters of the problem")
+    random_after, random_accuracy = _random_plans(problem, cell, seed, random_plans)
+    return DemoResult(
+        robot=robot.name,
+        configurations=len(plan.configurations),
+        measurements=plan.measurements,
+        sigma=problem.sigma,
+        before=_rms(cell.position_errors(robot, poses)),
+        after=_rms(cell.position_errors(robot.with_deviations(found), poses)),
+        predicted_accuracy=plan.predicted_accuracy,
+        random_after=random_after,
+        random_predicted_accuracy=random_accuracy,
+        random_plans=random_plans,
+        parameters=tuple(
+            DemoParameter(
+                p.name,
+                p.unit,
+                p.nominal,
+                p.nominal + float(truth.get(p.name, 0.0)),
+                p.nominal + found[p.name],
+                std[p.name],
+            )
+            for p in robot.parameters
+        ),
+        report=str(report),
+    )
+
+
+def _random_plans(problem: PlanProblem, cell: SimulatedCell, seed: int, count: int) -> tuple[float, float]:
+    """Achieved and predicted accuracy [m], root mean square over random plans of the problem's size."""
+    robot, poses = problem.robot, problem.test_pose_array
+    rng = np.random.default_rng([seed, 3])  # a stream of its own: the truth has [seed, 1]
+    low, high = robot.joint_limits.T
+    after, predicted = [], []
+    for _ in range(count):
+        q = rng.uniform(low, high, (problem.configurations, len(low)))
+        predicted.append(_accuracy(robot, q, problem))
+        data = cell.measure(q, problem.repetitions, int(rng.integers(2**31)))
+        estimate = identify(IdentificationProblem(robot, data, sigma=problem.sigma))
+        after.append(_rms(cell.position_errors(estimate.calibrated, poses)))
+    return _rms(np.array(after)), _rms(np.array(predicted))
+
+
+def _accuracy(robot: Robot, q: FloatArray, problem: PlanProblem) -> float:
+    """ρ0 of eq. (14) [m] of a plan with configurations ``q`` (m, joints) [rad | m]."""
+    model = InformationModel(robot, problem.instrument, repetitions=problem.repetitions)
+    matrix = model.at(q).sum(axis=0)
+    variances = [error_variance(j, matrix) for j in robot.jacobian(problem.test_pose_array)]
+    weights = problem.weight_array / problem.weight_array.sum()
+    return float(np.sqrt(weights @ np.array(variances)))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# ── for people ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def print_table(result: DemoResult, console: Console) -> None:
+    """Two tables: parameter by parameter, and the error at the test pose."""
+    table = Table(title=f"{result.robot}: deviations from nominal")
+    table.add_column("parameter")
+    table.add_column("unit")
+    for heading in ("true", "identified", "± std", "off by"):
+        table.add_column(heading, justify="right")
+    for p in result.parameters:
+        off = abs(p.value - p.true) / p.std if p.std > 0 else float("nan")
+        numbers = [f"{1e3 * x:+.4f}" for x in (p.true - p.nominal, p.value - p.nominal)]
+        table.add_row(p.name, SHOWN_UNIT[p.unit], *numbers, f"{1e3 * p.std:.4f}", f"{off:.1f} std")
+    console.print(table)
+    errors = Table(title="position error at the test pose [mm]")
+    errors.add_column("")
+    errors.add_column("achieved", justify="right")
+    errors.add_column("predicted ρ0", justify="right")
+    size = f"{result.configurations} configurations"
+    errors.add_row("before calibration", f"{1e3 * result.before:.4f}", "")
+    errors.add_row(f"planned, {size}", f"{1e3 * result.after:.4f}", f"{1e3 * result.predicted_accuracy:.4f}")
+    errors.add_row(
+        f"random, {size} (RMS of {result.random_plans} plans)",
+        f"{1e3 * result.random_after:.4f}",
+        f"{1e3 * result.random_predicted_accuracy:.4f}",
+    )
+    console.print(errors)
+    console.print(
+        f"One measured coordinate has a standard deviation of {1e3 * result.sigma:.4f} mm. "
+        "The random plans were measured in simulation by the library: same true robot, same noise."
+    )
+
+
+def draw(result: DemoResult, path: str | Path) -> Path:
+    """Draw the result to ``path`` (its suffix gives the format) and return it."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 4.2), layout="constrained")
+    accuracy, deviations, remainder = figure.subplots(1, 3, width_ratios=[1.2, 1, 1])
+    figure.suptitle(
+        f"{result.robot}: {result.configurations} configurations, "
+        f"{1e3 * result.before:.2f} mm before, {1e3 * result.after:.4f} mm after"
+    )
+    _draw_accuracy(accuracy, result)
+    names = [p.name for p in result.parameters]
+    x = np.arange(len(names))
+    true = 1e3 * np.array([p.true - p.nominal for p in result.parameters])
+    value = 1e3 * np.array([p.value - p.nominal for p in result.parameters])
+    std = 1e3 * np.array([p.std for p in result.parameters])
+    deviations.bar(x, true, color="0.8", label="true")
+    deviations.errorbar(x, value, 2 * std, fmt="o", ms=4, color="C0", label="identified")
+    deviations.set_title("deviation from nominal [mm | mrad]")
+    deviations.legend(frameon=False)
+    remainder.axhline(0, color="0.5", lw=1)
+    remainder.errorbar(x, 1e3 * (value - true), 2e3 * std, fmt="o", ms=4, capsize=3, color="C0")
+    remainder.set_title("identified − true, ± 2 std [µm | µrad]")
+    for axes in (deviations, remainder):
+        axes.set_xticks(x, names)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=120)
+    return Path(path)
+
+
+def _draw_accuracy(axes: Any, result: DemoResult) -> None:
+    rows = [
+        ("before", result.before, None),
+        ("planned", result.after, result.predicted_accuracy),
+        (f"random\n(RMS of {result.random_plans})", result.random_after, result.random_predicted_accuracy),
+    ]
+    colours = ["0.6", "C0", "C1"]
+    for i, (_, achieved, predicted) in enumerate(rows):
+        axes.barh(i, 1e3 * achieved, color=colours[i], height=0.6)
+        right = 1e3 * max(achieved, predicted or 0.0)
+        axes.text(right, i, f"  {1e3 * achieved:.4f}", va="center")
+        if predicted is not None:
+            label = "predicted ρ0" if i == 1 else None
+            axes.plot([1e3 * predicted] * 2, [i - 0.38, i + 0.38], "k--", label=label)
+    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    axes.set_xscale("log")
+    axes.margins(x=0.25)
+    axes.invert_yaxis()
+    axes.set_title("position error at the test pose [mm]")
+    axes.legend(frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -74,8 +74,11 @@ def said(line: str, printed: str) -> bool:
     return any(re.search(pattern, " ".join(row.split())) for row in printed.splitlines())
 
 
-def run(page: Path, folder: Path, timeout: float = 240.0) -> Run:
-    """Run the examples of ``page`` in ``folder``; ends at the first that fails."""
+def run(page: Path, folder: Path, timeout: float = 240.0, programs: Path | None = None) -> Run:
+    """Run the examples of ``page`` in ``folder``; ends at the first that fails.
+
+    ``programs``: a folder that comes first in PATH.
+    """
     for name in COPIED:
         shutil.copytree(ROOT / name, folder / name)
     (folder / "env.sh").write_text("")
@@ -93,7 +96,7 @@ def run(page: Path, folder: Path, timeout: float = 240.0) -> Run:
     done = subprocess.run(
         ["bash", "-c", "\n".join(lines)],
         cwd=folder,
-        env=environment(),
+        env=environment(programs),
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -103,7 +106,8 @@ def run(page: Path, folder: Path, timeout: float = 240.0) -> Run:
     return Run(done.returncode, done.stdout.split(f"\n{BORDER}\n")[1:], done.stderr[-3000:])
 
 
-def environment() -> dict[str, str]:
-    """This interpreter's commands first, one thread, no colours."""
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+def environment(programs: Path | None = None) -> dict[str, str]:
+    """``programs`` and this interpreter's commands first, one thread, no colours."""
+    first = [] if programs is None else [str(programs)]
+    path = os.pathsep.join([*first, str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     return {**os.environ, "PATH": path, "OMP_NUM_THREADS": "1", "NO_COLOR": "1"}

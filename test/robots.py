@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_planner import Plan, Robot
-from calib_planner.robot.urdf import parse_urdf
+from calib_planner.io import parse_urdf
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from docs_examples import ROOT, blocks, environment, examples, expectations, run, said
+from warm_commands import warm_commands
 
 from calib_planner.cli import main
 
@@ -31,7 +33,7 @@ def record_bag(folder: Path) -> None:
     from bags import campaign, write_bag
 
     from calib_planner import Robot
-    from calib_planner.files.measurements_csv import read_measurements
+    from calib_planner.io import read_measurements
     from calib_planner.simulation import SimulatedCell, random_deviations
 
     robot = Robot.load(DOCS / "examples" / "ur10e.urdf").with_targets([[0.06, 0.0, 0.03]])
@@ -44,12 +46,19 @@ def record_bag(folder: Path) -> None:
 PREPARED: dict[str, Callable[[Path], None]] = {"docs/real-robot-data.md": record_bag}
 
 
+@pytest.fixture(scope="module")
+def programs() -> Iterator[Path]:
+    """``calib-planner`` and ``python``; the imports that all pages' commands share are made once."""
+    with tempfile.TemporaryDirectory() as folder, warm_commands(Path(folder), environment()) as made:
+        yield made
+
+
 @pytest.mark.parametrize("page", [p for p in PAGES if examples(p)], ids=named)
-def test_examples_run_and_print_what_the_page_says(page: Path, tmp_path: Path) -> None:
+def test_examples_run_and_print_what_the_page_says(page: Path, tmp_path: Path, programs: Path) -> None:
     if page.name == "scaling.md":
         pytest.importorskip("distributed")
     PREPARED.get(named(page), lambda _: None)(tmp_path)
-    done = run(page, tmp_path)
+    done = run(page, tmp_path, programs=programs)
     shown = examples(page)
     assert done.status == 0, f"{page.name}, line {shown[len(done.printed) - 1].line}:\n{done.errors}"
     for number, line in expectations(page):
@@ -94,6 +103,28 @@ def test_the_runner_sees_failures_and_wrong_output(tmp_path: Path) -> None:
     hidden = "<!-- not run: no robot here -->\n```python\nraise SystemExit(3)\n```\n"
     page.write_text(hidden)
     assert blocks(page) == []
+
+
+def test_forked_commands_and_scripts_are_like_processes_of_their_own(programs: Path, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("import sys\nprint(sys.argv, __name__)\nraise SystemExit(3)\n")
+    calls = (
+        ("calib-planner", "robots", "show", "planar_2r", "--json"),
+        ("calib-planner", "robots", "show", "nothing"),
+        ("python", str(script), "a b"),
+    )
+    for name, *words in calls:
+        first, *others = (
+            subprocess.run(
+                [path / name, *words], cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60
+            )
+            for path in (Path(sys.executable).parent, programs, programs)
+        )
+        for done in others:
+            assert (done.returncode, done.stdout, done.stderr) == (first.returncode, first.stdout, first.stderr)
+    script.write_text("1 / 0\n")
+    done = subprocess.run([programs / "python", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and done.stderr.endswith("\nZeroDivisionError: division by zero\n")
 
 
 # ---- reference pages -----------------------------------------------------------------------------

@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from calib_planner import IdentificationProblem, Robot, _threads, identify
-from calib_planner._threads import ONE_THREAD, one_thread
+from calib_planner import IdentificationProblem, Robot, arrays, identify
+from calib_planner.arrays import ONE_THREAD, one_thread
 from calib_planner.identification import solver
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -73,6 +73,6 @@ def test_the_last_one_out_puts_it_back() -> None:
 
 
 def test_without_the_library_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_threads, "ThreadpoolController", None)
+    monkeypatch.setattr(arrays, "ThreadpoolController", None)
     with ONE_THREAD:
         assert threads() == {2}

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner.arrays import FloatArray
 from calib_planner.errors import InputError
-from calib_planner.files.configurations_csv import angle_factors, read_configurations
-from calib_planner.robot.chain import Robot
+from calib_planner.io import angle_factors, read_configurations, read_constraints, read_instrument
+from calib_planner.robot import Robot
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
 
@@ -127,3 +127,30 @@ def _rows(option: str, rows: Sequence[Sequence[float]], length: int, names: Sequ
     if not np.isfinite(array).all():
         raise InputError(option, "a number that is not finite", "finite numbers", "correct that number")
     return array
+
+
+# ── Options that say what the instrument is and what may be measured at all ─────────────────────────────────
+
+
+def add_conditions(parser: argparse._ActionsContainer) -> None:
+    """--constraints, and --sigma or --instrument."""
+    parser.add_argument(
+        "--constraints",
+        metavar="FILE",
+        help="YAML: workspace, floor, tracker's view, … (config/constraints.yaml shows all)",
+    )
+    noise = parser.add_mutually_exclusive_group()
+    noise.add_argument(
+        "--sigma", type=float, default=3e-5, metavar="S", help="tracker's std of one coordinate [m] (3e-5)"
+    )
+    noise.add_argument("--instrument", metavar="FILE", help="YAML: noise by direction (config/instruments/)")
+
+
+def conditions(args: argparse.Namespace, robot: Robot) -> dict[str, Any]:
+    """The arguments of ``PlanProblem`` that ``add_conditions`` is about."""
+    found: dict[str, Any] = {"sigma": args.sigma}
+    if args.instrument is not None:
+        found["noise"] = read_instrument(args.instrument)
+    if args.constraints is not None:
+        found["constraints"] = read_constraints(args.constraints, robot)
+    return found

@@ -3,43 +3,52 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-from calib_planner._arrays import check_count, check_number
-from calib_planner.adaptive import CampaignProblem, CampaignResult, CampaignState, Finished, from_measurements
-from calib_planner.adaptive.campaign import FIT, VALIDATION
-from calib_planner.adaptive.decision import decide
-from calib_planner.adaptive.run import run_campaign
-from calib_planner.adaptive.simulated import simulated
+from calib_planner.arrays import FloatArray, check_count, check_number
+from calib_planner.campaign import (
+    FIT,
+    OUTCOMES,
+    VALIDATION,
+    CampaignProblem,
+    CampaignResult,
+    CampaignState,
+    Finished,
+    Round,
+    decide,
+    from_measurements,
+    run_campaign,
+)
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
+    add_conditions,
     add_parameters,
     add_robot,
     add_seed,
     add_test_poses,
     choose_parameters,
+    conditions,
     load_robot,
     test_poses,
 )
-from calib_planner.cli.campaign_table import show_next, show_result
-from calib_planner.cli.conditions import add_conditions, conditions
 from calib_planner.cli.terminal import Terminal
 from calib_planner.demo import independent_seeds
-from calib_planner.design.plan import plain
 from calib_planner.errors import InputError
-from calib_planner.files.configurations_csv import write_configurations
-from calib_planner.files.estimate_yaml import write_estimate
-from calib_planner.files.measurements_csv import read_measurements, write_measurements
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.problem import AUTOMATIC
-from calib_planner.identification.verdict import mm
-from calib_planner.robot.chain import Robot
-from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations
+from calib_planner.identification import AUTOMATIC
+from calib_planner.io import read_measurements, write_configurations, write_estimate, write_measurements
+from calib_planner.measurements import Measurements
+from calib_planner.planning import plain
+from calib_planner.robot import Robot
+from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations, simulated
+from calib_planner.units import counted, length
 
 DESCRIPTION = """Plan a batch, measure it, identify, plan the rest from what was measured, until the accuracy is
 reached, the budget is spent, or more measurements cannot help; then validate on configurations that took no part.
@@ -60,9 +69,8 @@ NUMBERS = {
 }
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
-    summary = "plan, measure and identify until it is accurate enough"
     parser = add_command(commands, "campaign", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
     add_parameters(parser)
@@ -204,7 +212,7 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
     with terminal.progress("measuring") as update:
 
         def watch(state: CampaignState) -> None:
-            accuracy = f", {mm(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
+            accuracy = f", {length(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
             update(state.spent() / problem.budget, f"{len(state.of_role(FIT))} measured{accuracy}")
 
         result = run_campaign(problem, simulated(world, noise_seed), watch)
@@ -238,3 +246,77 @@ def _write(folder: Path, result: CampaignResult) -> None:
         write_measurements(folder / "validation.csv", result.validation, "--output")
     if result.estimate is not None:
         write_estimate(folder / "estimate.yaml", result.estimate, "--output")
+
+
+# ── A campaign for people: its verdict and outcome first, then how it went ──────────────────────────────────
+
+STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
+SCATTER = {
+    "": "",
+    "as_stated": "as stated",
+    "noise": "noise, as repeated",
+    "discrepancy": "the robot's own",
+    "open": "open: more than stated",
+}
+
+
+def show_result(result: CampaignResult, achieved: FloatArray | None, console: Console) -> None:
+    """Print the end of a campaign; ``achieved`` (K,) is the truth of a simulation [m]."""
+    console.print(
+        f"{result.verdict.level}: {result.outcome.replace('_', ' ')}", style=STYLES[result.verdict.level]
+    )
+    console.print(f"{result.message}: {OUTCOMES[result.outcome]}.", soft_wrap=True)
+    for reason in (r for r in result.verdict.reasons if r.level != "PASS" or "test_pose" in r.code):
+        advice = f" → {reason.advice}" if reason.advice else ""
+        console.print(f"  {reason.level}  {reason.text}{advice}", soft_wrap=True)
+    console.print(rounds_table(result.rounds))
+    estimate = result.estimate
+    if estimate is not None and estimate.validation is not None:
+        v = estimate.validation
+        console.print(
+            f"Validation on {counted(v.count, 'point')}: {length(v.rms)} achieved, {length(v.predicted_rms)} "
+            f"predicted (rms); before calibration {length(v.before_mean)} (mean)."
+        )
+    if achieved is not None:
+        true = ", ".join(length(a) for a in achieved)
+        console.print(f"True error at the test poses: {true}; {length(result.accuracy)} predicted.")
+    console.print(f"{result.spent} of {counted(result.budget, 'measurement')} spent, "
+                  f"{counted(len(result.exclusions), 'configuration')} given up.")  # fmt: skip
+
+
+def rounds_table(rounds: Sequence[Round]) -> Table:
+    """What was known after each batch."""
+    table = Table(title="rounds")
+    for heading in ("#", "measured", "different", "predicted", "σ", "still needed", "planned"):
+        table.add_column(heading, justify="right")
+    table.add_column("scatter")
+    for r in rounds:
+        known = np.isfinite(r.sigma)
+        cells = [str(r.measured), str(r.configurations), length(r.accuracy) if known else "–"]
+        cells += [length(r.sigma) if known else "–", _left(r.left), str(r.planned)]
+        table.add_row(str(r.number), *cells, SCATTER[r.scatter])
+    return table
+
+
+def show_next(state: CampaignState, q: FloatArray, times: Sequence[int], console: Console) -> None:
+    """Print what to measure next: configurations ``q`` (m, joints) [rad | m], each ``times``."""
+    robot = state.problem.robot
+    console.print(f"{state.outcome + ': ' if state.outcome else ''}{state.message}")
+    if state.rounds:
+        console.print(rounds_table(state.rounds))
+    held_out = state.stops[state.queue[0]].role == VALIDATION
+    table = Table(title="measure next, for validation" if held_out else "measure next, in this order")
+    table.add_column("#", justify="right")
+    for name, turns in zip(robot.joint_names, robot.joint_is_revolute, strict=True):
+        table.add_column(f"{name}\n[{'°' if turns else 'mm'}]", justify="right")
+    table.add_column("measure", justify="right")
+    factors = np.where(robot.joint_is_revolute, 180.0 / np.pi, 1e3)
+    for i, (row, count) in enumerate(zip(q * factors, times, strict=True), 1):
+        table.add_row(str(i), *(f"{v:.2f}" for v in row), f"{count}×")
+    console.print(table)
+
+
+def _left(number: float) -> str:
+    if np.isnan(number):
+        return "–"
+    return f"{number:.0f}" if np.isfinite(number) else "out of reach"

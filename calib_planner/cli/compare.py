@@ -10,18 +10,18 @@ from rich.console import Console
 from rich.table import Table
 
 from calib_planner.cli.arguments import Commands, add_command
-from calib_planner.cli.plan_problem import add_problem, make_problem
+from calib_planner.cli.plan import add_problem, make_problem
 from calib_planner.cli.terminal import Terminal
-from calib_planner.design.compare import Comparison, compare
 from calib_planner.errors import InputError
+from calib_planner.planning import Comparison, compare
 
 EXAMPLE = """calib-planner compare --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
       --configurations 3 4 12 --replicate 3x4 4x3 --random 20000"""
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
-    parser = add_command(commands, "compare", "the proposed plan beside random plans (Table 2)", run, EXAMPLE)
+    parser = add_command(commands, "compare", summary, run, EXAMPLE)
     work = add_problem(parser, any_criterion=False)
     work.add_argument(
         "--configurations", type=int, nargs="+", default=[], metavar="M", help="numbers of configurations"

@@ -10,17 +10,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner._arrays import FloatArray
+from calib_planner.arrays import FloatArray
 from calib_planner.cli.arguments import Commands, add_command, add_robot, add_seed, load_robot, numbers
 from calib_planner.cli.terminal import Terminal
+from calib_planner.compensation import STATUS, Compensation, compensate
 from calib_planner.errors import InputError
-from calib_planner.files.calibrated_robot import calibrated_robot
-from calib_planner.files.configurations_csv import read_configurations
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.table import format_table
-from calib_planner.files.text import write_text
-from calib_planner.robot.chain import Robot
-from calib_planner.robot.compensation import STATUS, Compensation, compensate
+from calib_planner.io import calibrated_robot, format_table, read_configurations, read_estimate, write_text
+from calib_planner.robot import Robot
 
 EXAMPLE = """calib-planner compensate --robot arm.urdf --estimate estimate.yaml \\
       --targets path.csv --output corrected.csv"""
@@ -35,9 +31,8 @@ stands before the tracker plays no part. Joint corrections that the estimate hol
 ERRORS = ("position_error", "rotation_error", "reached")
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
-    summary = "corrected joint targets for a controller with the nominal model"
     parser = add_command(commands, "compensate", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser, targets=False)
     what = parser.add_argument_group("what to correct")

@@ -6,21 +6,20 @@ import argparse
 
 from calib_planner.cli.arguments import Commands, add_command, add_seed
 from calib_planner.cli.terminal import Terminal
-from calib_planner.demo import DemoSettings, run_demo
-from calib_planner.design.planner import Progress
-from calib_planner.report.demo_report import print_table
+from calib_planner.demo import DemoSettings, print_table, run_demo
+from calib_planner.planning import Progress
 
 DESCRIPTION = """Plan for a KUKA KR 270, measure with a simulated tracker, identify, compare with the truth
 and with random plans of the same size. Needs no ROS. Shown in mm; with --json in metres and radians."""
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     usual = DemoSettings()
     parser = add_command(
         commands,
         "demo",
-        "plan, measure and identify a simulated robot",
+        summary,
         run,
         "calib-planner demo --seed 3",
         DESCRIPTION,

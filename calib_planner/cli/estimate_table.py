@@ -14,9 +14,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from calib_planner.identification.estimate import Estimate, Validation
-from calib_planner.identification.noise_levels import NoiseLevels
-from calib_planner.report.quantities import length
+from calib_planner.identification import Estimate, NoiseLevels, Validation
+from calib_planner.units import length
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}

@@ -11,16 +11,16 @@ from rich.table import Table
 
 from calib_planner.cli.arguments import Commands, add_command, add_seed
 from calib_planner.cli.terminal import Terminal
-from calib_planner.design.plan import plain
-from calib_planner.robot.catalogue import shipped_robots
-from calib_planner.robot.chain import Robot
+from calib_planner.io import shipped_robots
+from calib_planner.planning import plain
+from calib_planner.robot import Robot
 
 EXAMPLE = "calib-planner robots show kuka_kr270"
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser, and those of list and show."""
-    parser = add_command(commands, "robots", "list the shipped robots, or show one", run_list, EXAMPLE)
+    parser = add_command(commands, "robots", summary, run_list, EXAMPLE)
     add_seed(parser)
     actions = parser.add_subparsers(dest="action", metavar="list|show")
     add_command(actions, "list", "list the shipped robots", run_list, "calib-planner robots list --json")

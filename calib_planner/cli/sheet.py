@@ -8,25 +8,29 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-from calib_planner._arrays import FloatArray, check_number
+from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.arguments import Commands, add_command, add_robot, load_robot, numbers
-from calib_planner.cli.sheet_table import show_sheet
 from calib_planner.cli.terminal import Terminal
-from calib_planner.design.plan import plain
-from calib_planner.design.plan_sheet import PlanSheet, plan_sheet
-from calib_planner.design.timetable import DWELL, Pace, usual_pace
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.files.configurations_csv import angle_factors
-from calib_planner.files.constraints_yaml import read_constraints
-from calib_planner.files.instrument_yaml import read_instrument
-from calib_planner.files.plan_sheet_files import write_sheet_csv, write_sheet_yaml
-from calib_planner.files.plan_yaml import read_plan
-from calib_planner.files.trajectory_yaml import write_trajectory
-from calib_planner.files.urdf_speeds import read_speed_limits
-from calib_planner.report.plan_sheet_page import write_sheet_page
-from calib_planner.robot.catalogue import URDF_SUFFIXES
-from calib_planner.robot.chain import Robot
+from calib_planner.io import (
+    URDF_SUFFIXES,
+    WORDS,
+    angle_factors,
+    read_constraints,
+    read_instrument,
+    read_plan,
+    read_speed_limits,
+    write_sheet_csv,
+    write_sheet_yaml,
+    write_trajectory,
+)
+from calib_planner.planning import DWELL, Pace, PlanSheet, plain, plan_sheet, usual_pace
+from calib_planner.report import write_sheet_page
+from calib_planner.robot import Robot
+from calib_planner.units import duration, length, signed
 
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --configurations 6 \\
       --constraints config/constraints.yaml --output plan.yaml
@@ -35,13 +39,13 @@ SHARE = 0.25
 FILES = ("plan_sheet.html", "plan_sheet.csv", "plan_sheet.yaml", "trajectory.yaml")
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     text = (
         "Everything a person at the robot needs to measure a plan: with --output a printable page, CSV, YAML and "
     )
     text += "a trajectory_msgs/JointTrajectory as YAML.\nWhat was not checked is called so."
-    parser = add_command(commands, "sheet", "a plan for the person at the robot", run, EXAMPLE, text)
+    parser = add_command(commands, "sheet", summary, run, EXAMPLE, text)
     parser.add_argument("--plan", required=True, metavar="FILE", help="plan .yaml, of plan --output")
     add_robot(parser, "the plan's, if it is a shipped one")
     known = parser.add_argument_group("what is to be checked")
@@ -154,3 +158,64 @@ def _start(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
     if not np.isfinite(args.start).all():
         raise InputError("--start", "a number that is not finite", "finite numbers", "correct that number")
     return np.array(args.start) * angle_factors(robot, degrees=args.degrees)
+
+
+# ── A plan sheet for the terminal: what the plan promises, its stops, what was checked and what not ─────────
+
+
+def show_sheet(sheet: PlanSheet, console: Console) -> None:
+    """Print a sheet."""
+    plan, checks, times = sheet.plan, sheet.checks, sheet.timetable
+    console.print(
+        f"Plan {sheet.identity} for {sheet.robot.name}: {plan.measurements} measurements at "
+        f"{len(plan.configurations)} stops, about {duration(times.seconds)}"
+    )
+    console.print(_promise(sheet))
+    console.print(_stops(sheet))
+    console.print(f"Checked: {', '.join(checks.checked)}. Not checked: {', '.join(checks.unchecked)}.")
+    if plan.robot != sheet.robot.name:
+        console.print(f"The plan was made for {plan.robot}.", style="yellow")
+    for i, broken in enumerate(checks.breaks, 1):
+        if broken:
+            console.print(f"Stop {i} breaks: {', '.join(broken)}", style="red")
+
+
+def _promise(sheet: PlanSheet) -> str:
+    plan = sheet.plan
+    accuracy = (
+        f"Expected accuracy ρ0 {length(plan.predicted_accuracy)}" if len(plan.test_poses) else plan.criterion
+    )
+    if not np.isfinite(plan.efficiency):
+        return f"{accuracy}."
+    bound = f", lower bound {length(plan.lower_bound)}" if np.isfinite(plan.lower_bound) else ""
+    return f"{accuracy}{bound} ({plan.bound}), efficiency {100 * plan.efficiency:.1f} %."
+
+
+def _stops(sheet: PlanSheet) -> Table:
+    table = Table(title="stops, in the order of visiting")
+    table.add_column("#", justify="right")
+    turns = sheet.robot.joint_is_revolute
+    for name, turning in zip(sheet.plan.joint_names, turns, strict=True):
+        table.add_column(f"{name}\n[{'°' if turning else 'mm'}]", justify="right", overflow="fold")
+    for heading in ("times", "travel\nmax", "reach", "visible"):
+        table.add_column(heading, justify="right", overflow="fold")
+    visible = sheet.checks.visible
+    for i, row in enumerate(sheet.degrees):
+        table.add_row(
+            str(i + 1),
+            *(signed(v, 3) for v in row),
+            f"{sheet.plan.repetitions[i]}×",
+            _travel(sheet, i),
+            WORDS[bool(sheet.checks.reachable[i])],
+            WORDS[None if visible is None else bool(visible[i])],
+        )
+    return table
+
+
+def _travel(sheet: PlanSheet, i: int) -> str:
+    """The longest way of a joint to stop i, in what people read."""
+    if np.isnan(sheet.timetable.travel[i]).any():
+        return "–"
+    turns = sheet.robot.joint_is_revolute
+    ways = [(t, sheet.total_travel(True, t)[i]) for t in (True, False) if (turns == t).any()]
+    return "\n".join(f"{np.degrees(w):.1f}°" if t else f"{1e3 * w:.1f} mm" for t, w in ways)

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner._arrays import FloatArray, IntArray, check_count, check_number
+from calib_planner.arrays import FloatArray, IntArray, check_count, check_number
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
@@ -21,21 +21,19 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.terminal import Terminal
 from calib_planner.demo import independent_seeds
-from calib_planner.design.plan import plain
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.files.configurations_csv import read_plan_csv
-from calib_planner.files.measurements_csv import measurements_text, write_measurements
-from calib_planner.files.plan_yaml import read_plan
-from calib_planner.robot.chain import Robot
+from calib_planner.io import measurements_text, read_plan, read_plan_csv, write_measurements
+from calib_planner.planning import plain
+from calib_planner.robot import Robot
 from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
 
 EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7 --output measured.csv
   calib-planner identify --robot kuka_kr270 --data measured.csv"""
 
 
-def add(commands: Commands) -> None:
+def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
-    parser = add_command(commands, "simulate", "measure a plan with a simulated robot", run, EXAMPLE)
+    parser = add_command(commands, "simulate", summary, run, EXAMPLE)
     add_robot(parser)
     add_parameters(parser)
     parser.add_argument(

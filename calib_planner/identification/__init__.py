@@ -1,0 +1,27 @@
+"""What the measurements say: a problem, the verb ``identify``, the estimate, its validation and verdict."""
+
+from calib_planner.identification.checks import FEWEST, SIGNIFICANT, check_units
+from calib_planner.identification.estimate import (
+    LEVELS,
+    STRONG,
+    ChiSquare,
+    Estimate,
+    Reason,
+    Validation,
+    Verdict,
+)
+from calib_planner.identification.evidence import fit_placement
+from calib_planner.identification.least_squares import SAME_JOINT, configuration_labels
+from calib_planner.identification.noise_levels import DOUBT, FEWEST_SPARE, NoiseLevels, improbable
+from calib_planner.identification.problem import (
+    AUTOMATIC,
+    LOSSES,
+    UPDATE,
+    IdentificationProblem,
+    Prior,
+    typical_prior,
+)
+from calib_planner.identification.robust import normalised
+from calib_planner.identification.solver import identify, start_robot
+from calib_planner.identification.transmission import JointCorrections, phases
+from calib_planner.identification.validation import cross_validate, validate

@@ -8,26 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray
-from calib_planner.design.identifiability import Identifiability, describe
-from calib_planner.identification.equations import Equations, point_whitening
+from calib_planner.arrays import FloatArray
+from calib_planner.identification.checks import Disturbance, HiddenErrors, Structure, copied_rows, explain
 from calib_planner.identification.estimate import (
     STATUS,
     ChiSquare,
     Estimate,
     residual_statistics,
 )
-from calib_planner.identification.hidden_errors import HiddenErrors
-from calib_planner.identification.least_squares import Fit, gauss_newton
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.motion import Motion
+from calib_planner.identification.least_squares import Equations, Fit, Motion, gauss_newton, point_whitening
 from calib_planner.identification.noise_levels import NoiseLevels
-from calib_planner.identification.order_check import Disturbance
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
-from calib_planner.identification.structure import Structure
-from calib_planner.identification.suspicions import copied_rows, explain
 from calib_planner.identification.transmission import Transmission
-from calib_planner.robot.chain import Robot
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Identifiability, Robot, describe
+from calib_planner.units import length
 
 BLIND = 1e-5
 """A test pose that moves less than this per unit of an unseen combination does not depend on it [m/m | m/rad]."""
@@ -243,8 +238,8 @@ def _suspects(evidence: Evidence, predicted: FloatArray) -> tuple[dict[str, Any]
 
 def _point(evidence: Evidence, predicted: FloatArray, i: int, t: int, words: str) -> dict[str, Any]:
     """Row (from 0), target (from 1), reason, residual in standard deviations and in metres."""
-    length = float(evidence.normalised[i, t])
+    ratio = float(evidence.normalised[i, t])
     error = float(np.linalg.norm(evidence.problem.data.p[i, t] - predicted[i, t]))
-    reason = f"{length:.3g} standard deviations (gate {evidence.gate:.3g}), {1e3 * error:.3g} mm off"
+    reason = f"{ratio:.3g} standard deviations (gate {evidence.gate:.3g}), {length(error)} off"
     reason += f"; {words}" if words else ""
-    return {"row": i, "target": t + 1, "reason": reason, "normalised_residual": length, "residual": error}
+    return {"row": i, "target": t + 1, "reason": reason, "normalised_residual": ratio, "residual": error}

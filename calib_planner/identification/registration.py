@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import NotEnoughDataError
-from calib_planner.identification.measurements import Measurements
-from calib_planner.robot.chain import Robot
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,14 +14,13 @@ import functools
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher_f
+from scipy.special import chdtri, fdtri
 
-from calib_planner._arrays import FloatArray
-from calib_planner.identification.equations import Equations
-from calib_planner.identification.measurements import Measurements
+from calib_planner.arrays import FloatArray
+from calib_planner.identification.least_squares import Equations
 from calib_planner.identification.registration import place, tip_poses
-from calib_planner.robot.chain import Robot
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
 
 ALARM = 0.01
 """Probability that a set without gross errors loses a point."""
@@ -35,7 +34,7 @@ SETTLED = 0.01
 """Weights that change by less do not move a point through the gate; those near it are judged again by the fit."""
 LEAST_SCALE = 1e-8
 """Least variance that residuals without any freedom are taken to have, in units of the instrument's."""
-MEDIAN = float(chi2.median(3))
+MEDIAN = float(chdtri(3, 0.5))
 
 
 @functools.lru_cache(maxsize=256)
@@ -48,8 +47,8 @@ def gate_of(points: int, freedom: float = np.inf) -> float:
     """
     probability = ALARM / max(points, 1)
     if np.isinf(freedom):
-        return float(np.sqrt(chi2.isf(probability, 3)))
-    return float(np.sqrt(3.0 * fisher_f.isf(probability, 3, max(freedom, 1.0))))
+        return float(np.sqrt(chdtri(3, probability)))
+    return float(np.sqrt(3.0 * fdtri(3, max(freedom, 1.0), 1.0 - probability)))
 
 
 def normalised(residuals: FloatArray, covariance: FloatArray) -> FloatArray:

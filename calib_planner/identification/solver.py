@@ -17,23 +17,26 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray
-from calib_planner._threads import one_thread
+from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.errors import NotEnoughDataError
-from calib_planner.identification.distance_check import check_distances
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.evidence import Evidence, estimate_of
-from calib_planner.identification.hidden_errors import HiddenErrors, hidden_errors
-from calib_planner.identification.least_squares import Fit, gauss_newton
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.noise_levels import improbable
-from calib_planner.identification.order_check import (
+from calib_planner.identification.checks import (
+    SIGNIFICANT,
     Disturbance,
+    HiddenErrors,
+    Structure,
+    check_distances,
     check_order,
+    check_units,
+    hidden_errors,
     instead_of_discrepancy,
     rejected_since,
+    residual_structure,
     wholly_whitened,
 )
+from calib_planner.identification.estimate import Estimate
+from calib_planner.identification.evidence import Evidence, estimate_of
+from calib_planner.identification.least_squares import Fit, gauss_newton
+from calib_planner.identification.noise_levels import improbable
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
 from calib_planner.identification.robust import (
@@ -42,12 +45,10 @@ from calib_planner.identification.robust import (
     robust_registration,
     select,
 )
-from calib_planner.identification.structure import SIGNIFICANT, Structure, residual_structure
-from calib_planner.identification.suspicions import check_units
 from calib_planner.identification.transmission import Transmission, fit_transmission, geometry_covariance
-from calib_planner.identification.weighing import TINY, Weighed, weigh
-from calib_planner.identification.work import Work, without_unseen
-from calib_planner.robot.chain import Robot
+from calib_planner.identification.weighing import TINY, Weighed, Work, weigh, without_unseen
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
 
 MOST_GATES = 12
 """Rounds of the gate; a selection that still changes then is taken as it is."""

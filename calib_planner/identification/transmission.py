@@ -1,21 +1,11 @@
-"""Errors of the joints' transmissions, learnt together with the geometry.
+"""What a joint really does: its reading plus a function of that reading.
 
-Each φ_l (see ``robot.joint_corrections``) is a Gaussian process in that joint's own angle. With c_l = ∂p/∂q_l,
+Gears, couplings and encoders turn a joint by φ(q) more than it says, repeatably. φ has no constant part, which is
+the joint's zero and a geometric parameter; what is left is a short Fourier series,
 
-    p = f(q, Π) + Σ_l c_l(q) φ_l(q_l) + e,     cov φ_l = σ_φ² k(q_l − q_l'),
-    k(Δ) ∝ exp((cos Δ − 1)/ℓ²) = e^{−κ} Σ_n I_n(κ) cos nΔ,     κ = 1/ℓ²,
+    φ_l(q) = Σ_n a_ln cos n x + b_ln sin n x,      x = q of turning joints, half a turn over the range if sliding.
 
-I_n being modified Bessel functions, less its constant part: near zero a squared exponential of length ℓ, and
-exactly a Fourier series with independent coefficients, of variance ∝ I_n(κ). So the model is linear in geometry
-and coefficients alike, with Gaussian priors, and one least squares gives both.
-
-σ_φ, and the white parts of the discrepancy beside it (``noise_levels``), maximise the restricted likelihood for
-each ℓ of a grid, by the average-information method (Gilmour, Thompson & Cullis 1995),
-
-    score_k = ½ (yᵀPV_kPy − tr PV_k),     information_kl = ½ yᵀPV_kPV_lPy,
-
-on at most ``MOST`` equations; ℓ is the one of the largest likelihood. The functions are used only if they are
-worth ``GAIN`` in log likelihood: joints without transmission errors get none.
+With it the robot is where its geometry puts it at the joint values q + φ(q).
 """
 
 from __future__ import annotations
@@ -24,15 +14,99 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ive
 
-from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.identification.equations import Equations, block_covariance
-from calib_planner.identification.least_squares import Fit
+from calib_planner.arrays import FloatArray, IntArray, check_array, check_configurations
+from calib_planner.errors import InputError
+from calib_planner.identification.least_squares import Equations, Fit, block_covariance
 from calib_planner.identification.noise_levels import DiscrepancyModel
-from calib_planner.robot.chain import Robot
-from calib_planner.robot.joint_corrections import JointCorrections, harmonics, phases
+from calib_planner.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class JointCorrections:
+    """φ of every joint.
+
+    Attributes:
+        joint_names: Order of joint arrays.
+        scale: (joints,) x = scale · (q − shift).
+        shift: (joints,) [rad | m].
+        cosines: (joints, harmonics) a, the first harmonic first [rad | m].
+        sines: (joints, harmonics) b [rad | m].
+    """
+
+    joint_names: tuple[str, ...]
+    scale: ArrayLike
+    shift: ArrayLike
+    cosines: ArrayLike
+    sines: ArrayLike
+
+    def __post_init__(self) -> None:
+        put, joints = object.__setattr__, len(self.joint_names)
+        put(self, "joint_names", tuple(self.joint_names))
+        for name in ("scale", "shift"):
+            put(self, name, check_array(name, getattr(self, name), (joints,)))
+        for name in ("cosines", "sines"):
+            put(self, name, check_array(name, getattr(self, name), (joints, None)))
+        if np.shape(self.cosines) != np.shape(self.sines):
+            raise InputError("sines", np.shape(self.sines), f"as many as cosines, {np.shape(self.cosines)}")
+
+    def at(self, q: ArrayLike) -> FloatArray:
+        """φ(q): (N, joints) readings → (N, joints) [rad | m]."""
+        clean = check_configurations("configurations", q, self.joint_names)
+        x = (clean - np.asarray(self.shift)) * np.asarray(self.scale)
+        cosine, sine = harmonics(x, np.shape(self.cosines)[1])
+        cosines, sines = np.asarray(self.cosines), np.asarray(self.sines)
+        return np.einsum("njh,jh->nj", cosine, cosines) + np.einsum("njh,jh->nj", sine, sines)
+
+    def actual(self, q: ArrayLike) -> FloatArray:
+        """Where the joints are when they read ``q``: (N, joints)."""
+        return check_configurations("configurations", q, self.joint_names) + self.at(q)
+
+    def reading(self, actual: ArrayLike) -> FloatArray:
+        """What the joints read when they are at ``actual``: (N, joints), the inverse of ``actual``."""
+        wanted = check_configurations("configurations", actual, self.joint_names)
+        q = np.array(wanted)
+        for _ in range(50):  # φ is a few milliradians and flat: each round gains two digits or more
+            error = wanted - q - self.at(q)
+            q = q + error
+            if np.abs(error).max(initial=0.0) < 1e-15:
+                break
+        return q
+
+
+def phases(robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """Scale and shift (joints,) of x: turning joints as they are, sliding ones over half a turn."""
+    low, high = robot.joint_limits.T
+    turns = robot.joint_is_revolute
+    return np.where(turns, 1.0, np.pi / (high - low)), np.where(turns, 0.0, low)
+
+
+def harmonics(x: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """cos n x and sin n x, n = 1 … count: (N, joints) → two of (N, joints, count)."""
+    turned = np.exp(1j * x)[..., None] ** np.arange(1, count + 1)
+    return turned.real, turned.imag
+
+
+# ── Errors of the joints' transmissions, learnt together with the geometry ──────────────────────────────────
+# Each φ_l (see ``robot.joint_corrections``) is a Gaussian process in that joint's own angle. With c_l = ∂p/∂q_l,
+#
+#     p = f(q, Π) + Σ_l c_l(q) φ_l(q_l) + e,     cov φ_l = σ_φ² k(q_l − q_l'),
+#     k(Δ) ∝ exp((cos Δ − 1)/ℓ²) = e^{−κ} Σ_n I_n(κ) cos nΔ,     κ = 1/ℓ²,
+#
+# I_n being modified Bessel functions, less its constant part: near zero a squared exponential of length ℓ, and
+# exactly a Fourier series with independent coefficients, of variance ∝ I_n(κ). So the model is linear in geometry
+# and coefficients alike, with Gaussian priors, and one least squares gives both.
+#
+# σ_φ, and the white parts of the discrepancy beside it (``noise_levels``), maximise the restricted likelihood for
+# each ℓ of a grid, by the average-information method (Gilmour, Thompson & Cullis 1995),
+#
+#     score_k = ½ (yᵀPV_kPy − tr PV_k),     information_kl = ½ yᵀPV_kPV_lPy,
+#
+# on at most ``MOST`` equations; ℓ is the one of the largest likelihood. The functions are used only if they are
+# worth ``GAIN`` in log likelihood: joints without transmission errors get none.
 
 LENGTHS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
 """ℓ tried [rad]."""

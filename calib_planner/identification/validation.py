@@ -25,24 +25,23 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtri
 
-from calib_planner._arrays import FloatArray, check_count
-from calib_planner._threads import one_thread
+from calib_planner.arrays import FloatArray, check_count, one_thread
 from calib_planner.errors import InputError, NotEnoughDataError
-from calib_planner.identification.discrepancy import Discrepancy, fit_discrepancy
-from calib_planner.identification.equations import configuration_labels
 from calib_planner.identification.estimate import Estimate, Validation
 from calib_planner.identification.evidence import fit_placement
-from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.least_squares import configuration_labels
+from calib_planner.identification.noise_levels import Discrepancy, fit_discrepancy
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
 from calib_planner.identification.robust import normalised
 from calib_planner.identification.solver import identify, start_robot
 from calib_planner.identification.transmission import Transmission
-from calib_planner.robot.chain import Robot
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
 
-INSIDE = float(np.sqrt(chi2.ppf(0.95, 3)))
+INSIDE = float(np.sqrt(chdtri(3, 0.05)))
 
 
 @one_thread

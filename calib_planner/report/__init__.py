@@ -1,0 +1,5 @@
+"""Pages and charts for people: the calibration report, the plan sheet and where a result comes from."""
+
+from calib_planner.report.page import write_report
+from calib_planner.report.plan_sheet import write_sheet_page
+from calib_planner.report.provenance import InputFile, Provenance, provenance

@@ -122,7 +122,7 @@ def _text(path: str | Path) -> str:
 
 
 def _resolved(role: str, path: str | Path) -> Path:
-    from calib_planner.robot.catalogue import config_folder, shipped_robots
+    from calib_planner.io import config_folder, shipped_robots
 
     if role == "robot" and str(path) in shipped_robots():
         return config_folder() / "robots" / f"{path}.yaml"

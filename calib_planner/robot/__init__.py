@@ -1,0 +1,21 @@
+"""The robot: a chain of elementary transforms with named parameters, its kinematics,
+and which of its parameters data can identify.
+"""
+
+from calib_planner.robot.capsules import Capsules, segments
+from calib_planner.robot.chain import Robot, register_file_reader, target_elements
+from calib_planner.robot.elements import (
+    KINDS,
+    ROW_TYPES,
+    DhRow,
+    Element,
+    dh_elements,
+    dh_levels,
+    pose_elements,
+    rotation,
+)
+from calib_planner.robot.identifiability import NO_LEVER, Identifiability, analyse, describe
+from calib_planner.robot.inverse import Goals, goals_of, residuals, solve
+from calib_planner.robot.linearisation import Linearisation, Posture
+from calib_planner.robot.origins import JointOrigins, Origin, joint_origins, not_in_origins, with_origins
+from calib_planner.robot.parameters import Parameter, check_joint_names

@@ -14,10 +14,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner._arrays import FloatArray, check_array
+from calib_planner.arrays import FloatArray, check_array
 from calib_planner.errors import InputError
 from calib_planner.robot.chain import Robot
-from calib_planner.robot.posture import Posture
+from calib_planner.robot.linearisation import Posture
 
 SLENDERNESS = 0.05
 """Default radius as a share of the length of the chain from base to tip: 0.07 m for a reach of 1.3 m."""

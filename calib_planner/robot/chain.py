@@ -11,7 +11,7 @@ frame once the base pose has been set. Order of joints: ``joint_names``. Order o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,17 +20,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib_planner._arrays import FloatArray, check_array, check_configurations, frozen
-from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.arrays import FloatArray, check_array, check_configurations, frozen
+from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.robot.elements import Element, roll_pitch_yaw, rotation
-from calib_planner.robot.linearisation import Layout, Linearisation
+from calib_planner.robot.kinematics import Program, codes_of, compile_program, structure_of
+from calib_planner.robot.linearisation import Layout, Linearisation, Posture
 from calib_planner.robot.parameters import Parameter, resolve_parameters
-from calib_planner.robot.posture import Posture
-from calib_planner.robot.program import Program, compile_program
-from calib_planner.robot.tracing import codes_of, structure_of
 
 MOST_PROGRAMS = 64
 """Programs that a robot remembers."""
+
+
+def _no_file_reader(source: object, **links: object) -> Robot:
+    raise CalibPlannerError(f"{source}: robot files are read by calib_planner.io; import it first")
+
+
+_file_reader: list[Callable[..., Robot]] = [_no_file_reader]
+
+
+def register_file_reader(reader: Callable[..., Robot]) -> None:
+    """Make ``reader(source, base_link=…, tip_link=…)`` what ``Robot.load`` calls.
+
+    ``calib_planner.io`` registers its reader when it is imported. The kinematic model itself knows no files.
+    """
+    _file_reader[0] = reader
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +98,7 @@ class Robot:
             UnknownNameError: No shipped robot or file of that name.
             FileFormatError: The file does not parse; names the key or element at fault.
         """
-        from calib_planner.robot.catalogue import load_robot
-
-        return load_robot(source, base_link=base_link, tip_link=tip_link)
+        return _file_reader[0](source, base_link=base_link, tip_link=tip_link)
 
     def with_parameters(self, request: str | Sequence[str], unknown: Iterable[str] = ()) -> Robot:
         """The same robot with other active parameters; see ``parameters.resolve_parameters``."""

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.robot.chain import Robot
 
 ITERATIONS = 100

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray, check_array, frozen
+from calib_planner.arrays import FloatArray, check_array, frozen
 from calib_planner.errors import InputError
 from calib_planner.robot.chain import Robot
 from calib_planner.robot.elements import Element, pose_elements, roll_pitch_yaw, rotation

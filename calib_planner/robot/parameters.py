@@ -7,10 +7,11 @@ target offsets. Order: base, then chain, then targets for levels; a list keeps t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.errors import FileFormatError, InputError, UnknownNameError
 
 UNKNOWNS = ("base", "tool")
 BASE_PARAMETERS = ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz")
@@ -70,3 +71,28 @@ def resolve_parameters(
     if not names:
         raise InputError("parameters", "nothing", "at least one parameter", f"levels: {', '.join(levels)}")
     return tuple(names)
+
+
+# ── Joint names from files: what they may be, since the names of parameters are made of them ────────────────
+
+RESERVED = re.compile(r"base|target_[0-9]+")
+"""Prefixes of the parameters that place base and targets."""
+
+
+def check_joint_names(path: object, names: Sequence[str]) -> None:
+    """Refuse names that would give two parameters one name, or that no list of names could hold.
+
+    Raises:
+        FileFormatError: Naming the joint.
+    """
+    for name in names:
+        where = f"joint {name!r}"
+        if list(names).count(name) > 1:
+            raise FileFormatError(path, where, "this name twice", "each name once", "rename one of them")
+        if RESERVED.fullmatch(name):
+            expected = "a name other than base and target_1, target_2, …"
+            raise FileFormatError(
+                path, where, "a name that base or target parameters have", expected, "rename it"
+            )
+        if not name.strip() or "," in name or name != name.strip():
+            raise FileFormatError(path, where, repr(name), "a name without commas and outer spaces", "rename it")

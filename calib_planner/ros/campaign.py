@@ -1,362 +1,492 @@
-"""What has been measured of a plan, and the estimate it gives: the identifier without ROS.
-
-A campaign belongs to one plan (or to none); a plan with another name begins a new one, and a plan that comes back
-finds what was measured of it. Everything is in the store before it is in force here, so that a campaign made from
-the same store is this campaign again.
-
-Which points to believe is decided by all measurements together, from the beginning, every time one comes or goes
-(χ² against the estimate of the others, ``identification.robust``): an outlier of today may be vindicated by
-tomorrow's measurements. What changes is told and written, nothing is deleted. The estimate depends on which
-measurements there are and on nothing else, which makes it the same after a restart.
-"""
+"""From the parameters of the campaign node to a campaign's problem, and from its stops to plans on the wire."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+import math
+import time
+import uuid
+from dataclasses import dataclass
 
 import numpy as np
+from calib_planner_msgs.action import ExecutePlan
+from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
+from rclpy.publisher import Publisher
 
-from calib_planner._arrays import FloatArray
-from calib_planner.design.plan import Plan
-from calib_planner.errors import CalibPlannerError, InputError, NotEnoughDataError, StoreError, UnknownNameError
-from calib_planner.files.campaign_records import ACCEPTED, KEPT, OUTLIER, UNDONE, Decision
-from calib_planner.files.campaign_store import CampaignStore, StoredCampaign
-from calib_planner.identification.accumulator import UPDATE
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.problem import IdentificationProblem
-from calib_planner.identification.solver import identify
-from calib_planner.instrument.standstill import Rejection, Standstill
-from calib_planner.instrument.standstill_noise import mean_std
-from calib_planner.robot.chain import Robot
+from calib_planner.acquisition import pick_joints
+from calib_planner.arrays import FloatArray
+from calib_planner.campaign import (
+    FIT,
+    VALIDATION,
+    CampaignProblem,
+    CampaignResult,
+    CampaignState,
+    Finished,
+    Measure,
+    Paused,
+)
+from calib_planner.errors import InputError
+from calib_planner.identification import Verdict
+from calib_planner.io import write_estimate, write_measurements
+from calib_planner.planning import Plan
+from calib_planner.ros.executor import Ended, PlanExecution
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.messages import estimate_to_message, plan_to_message
+from calib_planner.ros.model import Model, NotReady
+from calib_planner.ros.planning import constraints_of
+from calib_planner.ros.session import confined
+from calib_planner.ros.settings import CampaignParameters, unknown_words, with_topics
+from calib_planner.units import cut, listed
 
-MOST_REJECTIONS = 10_000
-"""Rejected standstills of a campaign that are written; more are only counted: nobody shall fill the disk."""
-NOT_STORED = "not_stored"
-
-
-@dataclass(frozen=True)
-class Matching:
-    """How standstills are matched and weighted.
-
-    Attributes:
-        tolerance: Largest joint difference to a planned configuration [rad | m].
-        accept_unplanned: Use standstills in no plan.
-        sigma: Standard deviation of one coordinate of one sample [m]; 0: from the samples' scatter.
-        repeatability: Standard deviation that averaging does not reduce [m].
-        most: Measurements kept at most.
-    """
-
-    tolerance: float = 0.01
-    accept_unplanned: bool = False
-    sigma: float = 3e-5
-    repeatability: float = 0.0
-    most: int = 5000
+SAME = ("budget", "batch", "validation", "minimum", "attempts", "most_failures", "exclusion", "sigma", "starts",
+        "time_limit", "seed")  # fmt: skip
+"""Parameters that are fields of ``CampaignProblem``."""
 
 
-@dataclass(frozen=True)
-class TooFew:
-    """No estimate yet: ``missing`` is how many configurations at least are still needed; 0: it failed."""
-
-    missing: int
-    message: str
-
-
-class Campaign:
-    """Measurements of one plan by one robot.
-
-    Args:
-        nominal: The robot, its active parameters being the identifier's own choice.
-        follow: Chooses the robot's active parameters for a plan.
-        store: Where everything is kept; the campaign in it goes on.
-
-    Attributes:
-        plan_id, plan: The plan, if any.
-        robot: The robot whose parameters are identified now.
-        kept: What the identification is given, in the order of measuring: accepted, or an outlier for now.
-        newest: The last estimate, of what is in ``kept``; ``None`` if it has to be made anew.
+def problem_of(settings: CampaignParameters, model: Model | NotReady) -> CampaignProblem:
+    """What the parameters ask for.
 
     Raises:
-        CalibPlannerError: What the store holds does not fit the robot.
+        NotReady: There is no robot yet.
+        InputError: A parameter is not usable for this robot.
+    """
+    if not isinstance(model, Model):
+        raise model
+    if not settings.test_pose_rows:
+        names = ", ".join(model.robot.joint_names)
+        raise InputError("test_poses", "none", f"joint coordinates in the order {names}", "set the parameter")
+    robot = with_topics(model.robot, settings.targets or None, settings.unknown)
+    robot = robot.with_parameters(settings.parameters, unknown_words(settings.unknown))
+    lengths = {len(row) for row in settings.test_pose_rows}
+    if lengths != {len(robot.joint_names)}:
+        expected = f"{len(robot.joint_names)} numbers a pose: {', '.join(robot.joint_names)}"
+        raise InputError("test_poses", f"{sorted(lengths)} numbers", expected)
+    return CampaignProblem(
+        robot,
+        np.array(settings.test_pose_rows),
+        settings.required_accuracy,
+        constraints=constraints_of(settings, robot),  # type: ignore[arg-type]
+        identification={"joint_corrections": settings.joint_corrections},
+        **{name: getattr(settings, name) for name in SAME},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Announced:
+    """A plan that the identifier is told.
+
+    Attributes:
+        plan_id: Its name.
+        plan: The plan.
+        stops: Number of the stop of each row.
+        role: What they are for, ``fit`` or ``validation``.
     """
 
-    def __init__(self, nominal: Robot, follow: Callable[[Plan], Robot], store: CampaignStore) -> None:
-        self.nominal, self.robot, self.follow, self.store = nominal, nominal, follow, store
-        self.kept: list[Decision] = []
-        self.newest: Estimate | TooFew | None = None
-        self._unsaved: dict[int, Decision] = {}
-        self._others: Counter[str] = Counter()
-        self._enter(store.current() or StoredCampaign(0, "", None, ()))
+    plan_id: str
+    plan: Plan
+    stops: tuple[int, ...]
+    role: str
 
-    # ── plans ────────────────────────────────────────────────────────────────────────────────────────
-
-    def begin(self, plan_id: str, plan: Plan, tolerance: float, *, keep: bool = False) -> bool:
-        """Take a plan; ``False`` if it is the current one.
-
-        A plan that cannot be written now is taken all the same, and written before the first measurement.
-
-        Args:
-            tolerance: See ``Matching``.
-            keep: A plan that is new goes on with the measurements of the one before.
-
-        Raises:
-            InputError: The plan is for another robot, or another plan has its name.
-        """
-        if plan.robot != self.nominal.name:
-            raise UnknownNameError("plan.robot", plan.robot[:100], [self.nominal.name])
-        if plan.joint_names != self.nominal.joint_names:
-            got = ", ".join(plan.joint_names)[:200]
-            raise InputError("plan.joint_names", got, ", ".join(self.nominal.joint_names))
-        self.follow(plan)
-        known = self.store.find(plan_id, plan)
-        if self.plan is not None and self.plan_id == plan_id:
+    def covers(self, stop: int, state: CampaignState) -> bool:
+        """Whether the stop is in it as it is now: for the same purpose, and as often."""
+        if stop not in self.stops or state.stops[stop].role != self.role:
             return False
-        carried = _matched_anew(self.kept, plan, tolerance) if keep and known is None else ()
-        try:
-            self._enter(self.store.begin(plan_id, plan, carried))
-        except StoreError:
-            self._enter(replace(known or StoredCampaign(0, plan_id, plan, carried), number=0))
-        return True
+        return bool(self.plan.repetitions[self.stops.index(stop)] == state.stops[stop].times)
 
-    def _enter(self, stored: StoredCampaign) -> None:
-        robot = self.nominal if stored.plan is None else self.follow(stored.plan)
-        self.number, self.plan_id, self.plan, self.robot = stored.number, stored.plan_id, stored.plan, robot
-        self.kept = [d for d in stored.decisions if d.status in KEPT]
-        self._others = Counter(d.status for d in stored.decisions if d.status not in KEPT)
-        self.newest, self._unsaved = None, {}
-
-    def _ensure_begun(self) -> int:
-        """Number of the campaign, which is in the store from now on."""
-        if self.number == 0:
-            self.number = self.store.begin(self.plan_id, self.plan, self.kept).number
-        return self.number
-
-    def reset(self) -> int:
-        """Leave all measurements behind; returns how many.
-
-        Raises:
-            StoreError: That cannot be written; nothing was changed.
-        """
-        count = len(self.kept)
-        self._enter(self.store.restart(self.plan_id, self.plan))
-        return count
-
-    # ── measurements come and go ─────────────────────────────────────────────────────────────────────
-
-    def take(
-        self, found: Standstill, how: Matching, frame: str = "", objection: tuple[str, str] | None = None
-    ) -> Decision:
-        """Decide on a standstill, and keep it if it is accepted and written.
-
-        Args:
-            frame: Frame of its points.
-            objection: Status and reason of a rejection that was decided elsewhere.
-        """
-        index, reason = self._match(found.joints, how)
-        if objection is not None:
-            return self._reject(Decision(found, *objection, index, 0, frame=frame))
-        if reason and not how.accept_unplanned:
-            return self._reject(Decision(found, "not_in_plan", reason, None, 0, frame=frame))
-        if len(self.kept) >= how.most:
-            reason = f"{how.most} measurements are kept at most: raise most_measurements or call ~/reset"
-            return self._reject(Decision(found, "not_in_plan", reason, index, 0, frame=frame))
-        decision = Decision(found, ACCEPTED, "", index, self.done()[index], frame=frame)
-        try:
-            decision = replace(decision, number=self.store.record(self._ensure_begun(), decision))
-        except StoreError as error:
-            self._others[NOT_STORED] += 1
-            return decision.now(NOT_STORED, f"not stored: {error}")
-        self.kept.append(decision)
-        self.newest = None
-        return decision
-
-    def refuse(self, found: Rejection, frame: str = "") -> Decision:
-        """Note a standstill that was none."""
-        return self._reject(Decision(found, found.reason.value, found.message, None, 0, frame=frame))
-
-    def _reject(self, decision: Decision) -> Decision:
-        """Count it, and write it if that is possible: it was not promised to anybody."""
-        self._others[decision.status] += 1
-        if self._others.total() > MOST_REJECTIONS:
-            return decision
-        try:
-            return replace(decision, number=self.store.record(self._ensure_begun(), decision))
-        except StoreError:
-            return decision
-
-    def undo(self, number: int = 0) -> Decision | None:
-        """Withdraw a measurement, 0 for the newest; ``None`` if there is no such measurement in use.
-
-        Raises:
-            StoreError: That cannot be written; nothing was changed.
-        """
-        last = next((d for d in reversed(self.kept) if number in (0, d.number)), None)
-        if last is None:
-            return None
-        return self.withdraw(last, UNDONE, "withdrawn on request")
-
-    def withdraw(self, kept: Decision, status: str, reason: str) -> Decision:
-        """Use one of ``kept`` no more.
-
-        Raises:
-            StoreError: That cannot be written; nothing was changed.
-        """
-        gone = kept.now(status, reason)
-        self.store.decide(self._ensure_begun(), [gone])
-        self.kept.remove(kept)
-        self._unsaved.pop(kept.number, None)
-        self._others[status] += 1
-        self.newest = None
-        return gone
-
-    # ── what there is ────────────────────────────────────────────────────────────────────────────────
-
-    @property
-    def frame(self) -> str:
-        """Frame of the points that are kept; empty if none is, or none was named."""
-        return next((d.frame for d in self.kept if d.frame), "")
-
-    @property
-    def accepted(self) -> list[Decision]:
-        """What is used, in the order of measuring."""
-        return [d for d in self.kept if d.status == ACCEPTED]
-
-    @property
-    def rejections(self) -> Counter[str]:
-        """Standstills that are not used, by status."""
-        return self._others + Counter(d.status for d in self.kept if d.status != ACCEPTED)
-
-    def done(self) -> Counter[int | None]:
-        """Accepted measurements per row of the plan."""
-        return Counter(d.index for d in self.accepted)
-
-    def missing(self) -> list[int]:
-        """Rows of the plan that were not measured as often as planned, in its order."""
-        if self.plan is None:
-            return []
-        done = self.done()
-        return [i for i, r in enumerate(self.plan.repetitions.tolist()) if done[i] < r]
-
-    @property
-    def complete(self) -> bool:
-        """Whether every planned configuration was measured as often as planned."""
-        return self.plan is not None and not self.missing()
-
-    def _match(self, joints: FloatArray, how: Matching) -> tuple[int | None, str]:
-        """Row of the plan and, if there is none, why. Unfinished rows come first, then the nearest."""
-        plan = self.plan
-        if plan is None:
-            return None, "there is no plan: request one, or set accept_unplanned"
-        distance = np.abs(plan.configurations - joints).max(axis=1)
-        best = _nearest_row(plan, distance, self.done(), how.tolerance)
-        if best is None:
-            i = int(np.argmin(distance))
-            text = f"the nearest planned configuration, {i}, is {distance[i]:.4f} rad away"
-            return None, f"{text}, plan_tolerance is {how.tolerance:g}: check the pose"
-        return best, ""
-
-    # ── the estimate ─────────────────────────────────────────────────────────────────────────────────
-
-    def measurements(self, how: Matching) -> Measurements | None:
-        """What is kept, outliers and all, as the library's value; ``None`` if there is nothing."""
-        if not self.kept:
-            return None
-        found = [d.standstill for d in self.kept]
-        points = np.array([f.points for f in found])
-        std = mean_std(found, how.sigma, how.repeatability)
-        q = np.array([f.joints for f in found])
-        return Measurements(self.robot.joint_names, q, points, std)
-
-    def problem(self, how: Matching) -> IdentificationProblem:
-        """What is asked of the identification.
-
-        Raises:
-            NotEnoughDataError: Nothing was measured yet.
-        """
-        data = self.measurements(how)
-        poses = self.plan.test_poses if self.plan is not None and len(self.plan.test_poses) else None
-        if data is None:
-            raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-        # At every standstill: what takes long is left to the finished campaign, or to its analysis.
-        quick = dict(UPDATE) | ({"order_check": "auto"} if self.complete else {})
-        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses, **quick)
-
-    def estimate(self, how: Matching) -> Estimate | TooFew:
-        """Identify with what there is."""
-        try:
-            self.newest = identify(self.problem(how))
-        except NotEnoughDataError as error:
-            each = 3 * len(self.robot.targets)
-            missing = max(-(-(error.need - error.have) // each), 0)
-            text = f"{missing} more configurations needed at least: {error}" if missing else str(error)
-            self.newest = TooFew(missing, text)
-        except (CalibPlannerError, ArithmeticError, ValueError) as error:
-            self.newest = TooFew(0, f"identification failed: {error}")
-        return self.newest
-
-    def judge(self) -> list[Decision]:
-        """Those of ``kept`` about which the newest estimate thinks otherwise than before.
-
-        What cannot be written now is written with the next: the data it follows from are there.
-        """
-        rejected = defaultdict(list)
-        for point in self.newest.rejected if isinstance(self.newest, Estimate) else ():
-            rejected[point["row"]].append(point)
-        changed = []
-        for row, before in enumerate(self.kept):
-            own = rejected[row]
-            if not own and before.status == ACCEPTED and not before.unused:
-                continue
-            unused = tuple(sorted(int(r["target"]) - 1 for r in own))
-            seen = int((before.standstill.samples > 0).sum())
-            status = OUTLIER if own and len(own) == seen else ACCEPTED
-            if (status, unused) != (before.status, before.unused):
-                self.kept[row] = before.now(status, _reasons(own), unused)
-                changed.append(self.kept[row])
-        self._unsaved |= {d.number: d for d in changed}
-        if self._unsaved:
-            try:
-                self.store.decide(self._ensure_begun(), list(self._unsaved.values()))
-                self._unsaved = {}
-            except StoreError:
-                return changed
-        return changed
+    def part(self, row: int) -> Plan:
+        """One row, to be measured once."""
+        values = {name: getattr(self.plan, name) for name in self.plan.__dataclass_fields__}
+        values |= {"configurations": self.plan.configurations[row : row + 1], "repetitions": np.array([1])}
+        return Plan(**values)
 
 
-def condition_of(estimate: Estimate) -> float:
-    """Condition number of the identified parameters, each in units of its own standard deviation; NaN if unknown.
+def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
+    """All stops of ``role`` that were measured or are to be: what the identifier matches standstills to."""
+    measured = {r.index for r in state.rows}
+    stops = [i for i, s in enumerate(state.stops) if s.role == role and (i in measured or i in state.queue)]
+    problem, last = state.problem, state.rounds[-1] if state.rounds else None
+    poses = problem.test_pose_array
+    accuracy = float("nan") if last is None else last.accuracy
+    plan = Plan(
+        robot=problem.robot.name,
+        criterion="test_pose",
+        parameters=problem.robot.parameter_names,
+        joint_names=problem.robot.joint_names,
+        configurations=np.array([state.stops[i].q for i in stops]),
+        repetitions=np.array([state.stops[i].times for i in stops]),
+        test_poses=poses,
+        weights=np.full(len(poses), 1.0 / len(poses)),
+        sigma=problem.instrument.typical,
+        predicted_accuracy=accuracy,
+        predicted_accuracy_per_test_pose=np.full(len(poses), accuracy),
+        parameter_std=np.full(len(problem.robot.parameter_names), np.nan),
+        unidentifiable=(),
+        general_accuracy=float("nan"),
+        value=accuracy,
+        value_bound=float("nan"),
+        lower_bound=float("nan"),
+        efficiency=float("nan"),
+        bound="none",
+        status="ok",
+        message=state.message,
+        seconds=0.0,
+        seed=problem.seed,
+        starts=0,
+        evaluations=0,
+    )
+    return Announced(f"{campaign_id}-{role}-{uuid.uuid4().hex[:8]}", plan, tuple(stops), role)
 
-    The square root of that of their correlations: as for a Jacobian, 1 is best.
+
+# ── Measuring what a campaign wants measured: tell the identifier the plan, send the robot, hear what was acc
+# One configuration at a time, and every step has an end. A robot that refuses a configuration cannot reach it; a
+# standstill that the identifier rejects, or of which it says nothing, is a failed attempt. What is not there,
+# does not answer or would spoil any measurement (``ANYWHERE``) is not the configuration's fault: it is waited
+# for, and tried again every ``RETRY`` seconds.
+
+RETRY = 2.0
+"""Time between two attempts at something that did not answer [s]."""
+ANYWHERE = (
+    Measurement.REJECTED_TIME_SKEW,
+    Measurement.REJECTED_CLOCK_OFFSET,
+    Measurement.REJECTED_OTHER_FRAME,
+    Measurement.REJECTED_BAD_JOINTS,
+    Measurement.REJECTED_NOT_STORED,
+)
+"""Rejections that another configuration would meet as well."""
+
+
+@dataclass
+class Visit:
+    """Measuring one configuration once.
+
+    Attributes:
+        action: What the campaign wants.
+        since: When the phase began [s].
+        phase: ``telling`` the plan, ``sending`` the robot, ``moving``, ``judging`` (the identifier does).
+        said: The identifier's last reason for a rejection.
+        anywhere: Whether that was one of ``ANYWHERE``.
+        final: Whether this standstill is not judged again.
     """
-    variances = np.diag(estimate.covariance)
-    found = np.isfinite(variances) & (variances > 0)
-    if not found.any():
-        return float("nan")
-    scale = np.sqrt(variances[found])
-    values = np.linalg.eigvalsh(estimate.covariance[np.ix_(found, found)] / np.outer(scale, scale))
-    return float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else float("inf")
+
+    action: Measure
+    since: float
+    phase: str = "telling"
+    said: str = ""
+    anywhere: bool = False
+    final: bool = False
+
+    def next(self, phase: str) -> None:
+        """Begin a phase."""
+        self.phase, self.since = phase, time.monotonic()
 
 
-def _reasons(rejected: Iterable[dict[str, object]]) -> str:
-    """Why points are not used, in words."""
-    return "; ".join(f"target {r['target']}: {r['reason']}" for r in rejected)
+class Measuring:
+    """The robot and the identifier, as a campaign needs them; made in ``configure`` of ``node``.
+
+    Args:
+        plans: Where the identifier hears of plans.
+
+    Attributes:
+        visit: What is being measured.
+        waiting: What is waited for; empty if for nothing.
+        taken: The plan that the identifier has.
+    """
+
+    def __init__(self, node: ManagedNode[CampaignParameters], plans: Publisher) -> None:
+        self._node, self._out = node, plans
+        self._execution = PlanExecution(node, node.settings.value.execute_action)
+        self.begin("")
+
+    def begin(self, campaign_id: str) -> None:
+        """Nothing is known of any plan."""
+        self._id, self._plan = campaign_id, None
+        self._plans: dict[str, Announced] = {}
+        self.visit: Visit | None = None
+        self.waiting, self._waited_since, self._tried = "", 0.0, 0.0
+        self._spoilt = ""
+
+    taken = ""
+    _plan: Announced | None
+
+    @property
+    def busy(self) -> bool:
+        """Whether the robot is under way for us."""
+        return self._execution.busy
+
+    @property
+    def waited(self) -> float:
+        """How long it has been waiting [s]."""
+        return time.monotonic() - self._waited_since if self.waiting else 0.0
+
+    def leave(self) -> None:
+        """Nothing is to be measured now: the robot stops."""
+        self.visit, self._spoilt = None, ""
+        self._wait_for("")
+        self._execution.poll(self._settings.silence)
+        self._execution.cancel()
+
+    def back_to_fit(self) -> None:
+        """Tell the identifier the last plan of the fit again."""
+        fits = [p for p in self._plans.values() if p.role == FIT]
+        if fits and self._plan is not fits[-1]:
+            self._announce(fits[-1])
+
+    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
+
+    def heard(self, message: Measurement, state: CampaignState) -> CampaignState:
+        """What the identifier says of a standstill.
+
+        What it holds for an outlier counts as measured: the campaign looks for outliers itself, and its fit shall
+        not depend on what is measured for validation.
+
+        Raises:
+            InputError: A measurement of other joints.
+        """
+        known = any(r.number == message.id for r in state.rows)
+        if message.status not in (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER):
+            if known:
+                return state.withdrawn(int(message.id), cut(message.reason, 300) or "undone")
+            self._rejected(message)
+            return state
+        self._spoilt = ""
+        plan = self._plans.get(message.plan_id)
+        if known or plan is None or message.configuration_index >= len(plan.stops):
+            return state
+        points = np.array([[p.x, p.y, p.z] for p in message.points])
+        stop = plan.stops[message.configuration_index]
+        return state.measured(stop, _joints(message, state), points, int(message.id))
+
+    def _rejected(self, message: Measurement) -> None:
+        visit = self.visit
+        if visit is None or visit.phase not in ("moving", "judging"):
+            return
+        visit.said, visit.anywhere = cut(message.reason, 300), message.status in ANYWHERE
+        # Points tell a standstill that was rejected from one that was none, and may become one yet.
+        plan, row = self._plans.get(message.plan_id), message.configuration_index
+        here = plan is not None and row < len(plan.stops) and plan.stops[row] == visit.action.index
+        visit.final = here and len(message.points) > 0
+
+    # ── one step further ─────────────────────────────────────────────────────────────────────────────
+
+    def step(self, state: CampaignState, action: Measure) -> CampaignState:
+        """Go on measuring; the state as it is then."""
+        ended = self._execution.poll(self._settings.silence)
+        visit = self.visit
+        if visit is None or (visit.action.index, visit.action.repetition) != (action.index, action.repetition):
+            self.visit = visit = Visit(action, time.monotonic())
+            self._wait_for("")
+        if visit.phase == "moving":
+            if self._execution.begun:
+                self._wait_for("")
+            return state if ended is None else self._moved(state, visit, ended)
+        if self._execution.busy:
+            self._execution.cancel()  # of the visit before
+        elif visit.phase == "telling":
+            self._tell(state, visit)
+        elif visit.phase == "sending":
+            self._send(visit)
+        elif visit.final or time.monotonic() - visit.since > self._settings.patience:
+            return self._not_measured(state, visit)
+        return state
+
+    @property
+    def _settings(self) -> CampaignParameters:
+        return self._node.settings.value
+
+    def _tell(self, state: CampaignState, visit: Visit) -> None:
+        """The identifier has to know the plan before the robot stands there."""
+        plan = self._plan
+        if plan is None or not plan.covers(visit.action.index, state):
+            plan = announced(state, self._id, visit.action.role)
+            self._announce(plan)
+        if self.taken == plan.plan_id:
+            self._wait_for("")
+            visit.next("sending")
+        elif time.monotonic() - visit.since > RETRY:
+            own = f"{self._node.get_fully_qualified_name()}/plan"
+            self._wait_for(f"{self._settings.identifier} does not take the plan: is it there, plan_topic {own}?")
+            if self._due():
+                self._announce(plan)
+
+    def _announce(self, plan: Announced) -> None:
+        stamp = self._node.get_clock().now().nanoseconds
+        self._plan, self._plans[plan.plan_id] = plan, plan
+        self._out.publish(plan_to_message(plan.plan, plan.plan_id, stamp, self._settings.frame_id))
+
+    def _send(self, visit: Visit) -> None:
+        """The robot goes there."""
+        settings, plan = self._settings, self._plan
+        assert plan is not None
+        if not self._execution.ready:
+            self._wait_for(f"nobody offers {settings.execute_action}: is the robot's node there?")
+        elif not self.waiting or self._due():
+            stamp, row = self._node.get_clock().now().nanoseconds, plan.stops.index(visit.action.index)
+            goal = plan_to_message(plan.part(row), plan.plan_id, stamp, settings.frame_id)
+            self._execution.send(ExecutePlan.Goal(plan=goal, dwell=settings.dwell))
+            visit.next("moving")
+
+    def _moved(self, state: CampaignState, visit: Visit, ended: Ended) -> CampaignState:
+        index = visit.action.index
+        if ended.how == "done":
+            self._wait_for("")
+            visit.next("judging")
+        elif ended.how == "refused":
+            return state.unreachable(index, ended.message or "refused by the robot")
+        elif ended.how == "aborted":
+            self.visit = None
+            return state.failed(index, ended.message or "the robot stopped")
+        else:
+            self._wait_for(ended.message or f"{ended.how} by the robot")
+            visit.next("sending")
+        return state
+
+    def _not_measured(self, state: CampaignState, visit: Visit) -> CampaignState:
+        """The robot stood there, and the identifier did not accept it in time."""
+        name = self._settings.identifier
+        if not visit.said and not self._node.count_publishers(f"{name}/measurements"):
+            self._wait_for(f"{name} is not there")
+            visit.next("telling")
+            return state
+        if visit.anywhere:
+            self.visit, self._spoilt = None, visit.said
+            self._wait_for("")
+            return state
+        reason = visit.said or f"{name} said nothing within {self._settings.patience:g} s"
+        self._node.get_logger().warning(f"configuration {visit.action.index}: {reason}")
+        self.visit = None
+        return state.failed(visit.action.index, reason)
+
+    def _wait_for(self, what: str) -> None:
+        """For nothing, if it is empty, but that what spoils measurements passes."""
+        what = what or self._spoilt
+        if what and not self.waiting:
+            self._waited_since = self._tried = time.monotonic()
+            self._node.get_logger().warning(f"waiting: {what}")
+        self.waiting = what
+
+    def _due(self) -> bool:
+        """Whether it is time for another attempt."""
+        now = time.monotonic()
+        due = now - self._tried > RETRY
+        self._tried = now if due else self._tried
+        return due
 
 
-def _nearest_row(plan: Plan, distance: FloatArray, done: Counter[int | None], tolerance: float) -> int | None:
-    """Row of a plan within ``tolerance``: one that is not finished if there is one, then the nearest."""
-    near = np.flatnonzero(distance <= tolerance)
-    return min((int(i) for i in near), key=lambda i: (done[i] >= plan.repetitions[i], distance[i]), default=None)
+def _joints(message: Measurement, state: CampaignState) -> FloatArray:
+    """Where the robot stood, in its own order of joints."""
+    names = state.problem.robot.joint_names
+    if sorted(message.joint_names) != sorted(names):
+        raise InputError("measurement.joint_names", listed(message.joint_names), ", ".join(names))
+    return pick_joints(message.joint_names, message.joint_positions, names)
 
 
-def _matched_anew(kept: Iterable[Decision], plan: Plan, tolerance: float) -> tuple[Decision, ...]:
-    """Measurements of another plan, at the rows of this one; those of none stay in use, unplanned."""
-    done: Counter[int | None] = Counter()
-    carried = []
-    for decision in kept:
-        distance = np.abs(plan.configurations - decision.standstill.joints).max(axis=1)
-        index = _nearest_row(plan, distance, done, tolerance)
-        carried.append(replace(decision, index=index, repetition=done[index]))
-        done[index] += 1
-    return tuple(carried)
+# ── The end of a campaign: as message, and as files in the folder that the user chose ───────────────────────
+
+FIELD = "store_folder"
+
+
+def reasons_of(verdict: Verdict) -> list[str]:
+    """Reasons as lines, each with what to do."""
+    return [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in verdict.reasons]
+
+
+def result_message(result: CampaignResult, campaign_id: str) -> CalibrationEstimate | None:
+    """The estimate of the fit with the campaign's verdict, without stamp; ``None`` if there is none."""
+    if result.estimate is None or result.fit is None:
+        return None
+    others = {"verdict": result.verdict.level, "reasons": reasons_of(result.verdict), "plan_id": campaign_id}
+    return estimate_to_message(result.estimate, complete=result.outcome == "reached", **others)
+
+
+def write_result(folder: str, result: CampaignResult, campaign_id: str) -> None:
+    """``measurements_ID.csv``, ``validation_ID.csv``, ``estimate_ID.yaml``.
+
+    Raises:
+        CalibPlannerError: They cannot be written.
+    """
+    for name, data in (("measurements", result.fit), ("validation", result.validation)):
+        if data is not None:
+            write_measurements(confined(folder, f"{name}_{campaign_id}.csv"), data, FIELD)
+    if result.estimate is not None:
+        write_estimate(confined(folder, f"estimate_{campaign_id}.yaml"), result.estimate, FIELD)
+
+
+# ── A campaign's state as message ───────────────────────────────────────────────────────────────────────────
+
+OUTCOME = {
+    "": CampaignStatus.OUTCOME_OPEN,
+    "reached": CampaignStatus.OUTCOME_REACHED,
+    "budget_spent": CampaignStatus.OUTCOME_BUDGET_SPENT,
+    "limited": CampaignStatus.OUTCOME_LIMITED,
+    "unreachable": CampaignStatus.OUTCOME_UNREACHABLE,
+    "failed": CampaignStatus.OUTCOME_FAILED,
+}
+NAN = float("nan")
+
+
+def idle_status(reason: str) -> CampaignStatus:
+    """No campaign was begun."""
+    numbers = dict.fromkeys(
+        ("predicted_accuracy", "required_accuracy", "sigma", "validation_rms", "validation_predicted"), NAN
+    )
+    return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **numbers)
+
+
+def status_message(state: CampaignState, campaign_id: str, waiting: str, reason: str) -> CampaignStatus:
+    """How a campaign stands, without stamp.
+
+    Args:
+        waiting: What it waits for; empty if for nothing.
+        reason: What else there is to say.
+    """
+    problem, action, last = state.problem, state.action, state.rounds[-1] if state.rounds else None
+    allowed = max(problem.fit_budget - state.spent(FIT), 0)
+    left = 0 if state.outcome else allowed if not math.isfinite(state.left) else min(int(state.left), allowed)
+    message = CampaignStatus(
+        campaign_id=campaign_id,
+        robot=problem.robot.name,
+        state=_state(state, waiting),
+        outcome=OUTCOME[state.outcome],
+        round=len(state.rounds),
+        measured=len(state.of_role(FIT)),
+        left=left,
+        budget=problem.budget,
+        validated=len(state.of_role(VALIDATION)),
+        validation=problem.validation,
+        excluded=len(state.exclusions),
+        predicted_accuracy=NAN if last is None or math.isinf(last.accuracy) else last.accuracy,
+        required_accuracy=problem.required_accuracy,
+        sigma=NAN if last is None else last.sigma,
+        validation_rms=NAN,
+        validation_predicted=NAN,
+        round_measured=[r.measured for r in state.rounds],
+        round_accuracy=[r.accuracy for r in state.rounds],
+        joint_names=list(problem.robot.joint_names),
+        reason=cut("; ".join(filter(None, (waiting, reason, state.message)))),
+    )
+    if isinstance(action, Measure):
+        message.configuration_index, message.configuration = action.index, action.q.tolist()
+    if isinstance(action, Finished):
+        _fill_result(message, action.result)
+    return message
+
+
+def _state(state: CampaignState, waiting: str) -> int:
+    action = state.action
+    if isinstance(action, Finished):
+        return int(CampaignStatus.DONE)
+    if isinstance(action, Paused):
+        return int(CampaignStatus.PAUSED)
+    if waiting:
+        return int(CampaignStatus.WAITING)
+    if isinstance(action, Measure):
+        return int(CampaignStatus.MEASURING if action.role == FIT else CampaignStatus.VALIDATING)
+    return int(CampaignStatus.PLANNING)
+
+
+def _fill_result(message: CampaignStatus, result: CampaignResult) -> None:
+    message.predicted_accuracy = NAN if math.isinf(result.accuracy) else result.accuracy
+    message.verdict = result.verdict.level
+    message.reasons = reasons_of(result.verdict)
+    found = None if result.estimate is None else result.estimate.validation
+    if found is not None:
+        message.validation_rms, message.validation_predicted = found.rms, found.predicted_rms

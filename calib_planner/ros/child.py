@@ -1,4 +1,4 @@
-"""``python -m calib_planner.ros.child MODULE …``: a node that ends when whoever started it is no more.
+"""``python -m calib_planner.ros.child NAME_node …``: a node that ends when whoever started it is no more.
 
 The parent holds the other end of this process's standard input and never writes to it. However the parent ends,
 by ``kill -9`` too, the system closes that end: then the node is told to end as Ctrl-C would tell it, and one that
@@ -32,12 +32,12 @@ def _watch() -> None:
 
 
 def main() -> None:
-    """Run the module ``calib_planner.ros.MODULE`` with what follows on the command line."""
+    """Run the node of the executable ``NAME_node`` (``nodes/NAME.py``) with what follows on the command line."""
     if len(sys.argv) < 2 or not sys.argv[1].isidentifier():
-        raise SystemExit("usage: python -m calib_planner.ros.child MODULE [--ros-args …]")
+        raise SystemExit("usage: python -m calib_planner.ros.child NAME_node [--ros-args …]")
     end_with_parent()
-    module = sys.argv.pop(1)
-    runpy.run_module(f"calib_planner.ros.{module}", run_name="__main__", alter_sys=True)
+    node = sys.argv.pop(1).removesuffix("_node")
+    runpy.run_module(f"calib_planner.ros.nodes.{node}", run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

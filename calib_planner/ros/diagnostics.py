@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from calib_planner.files.campaign_store import UnavailableStore
-from calib_planner.identification.estimate import Estimate
-from calib_planner.instrument.clock_offset import Offset
-from calib_planner.ros.campaign import Campaign, condition_of
-from calib_planner.ros.conversions import stamp_message
+from calib_planner.acquisition import Offset
+from calib_planner.identification import Estimate
+from calib_planner.io import UnavailableStore
+from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.session import Campaign, condition_of
+from calib_planner.units import cut, milliseconds
 
 OK, WARN, ERROR, STALE = (
     DiagnosticStatus.OK,
@@ -102,7 +103,8 @@ def _stream(s: StreamHealth, bound: float) -> Finding:
         "lost": s.lost,
     }
     if s.offset is not None and s.offset.exceeds(bound):
-        text = f"clock {1e3 * s.offset.seconds:+.0f} ms from the joints', {1e3 * bound:.0f} ms are allowed"
+        offset = milliseconds(s.offset.seconds, plus=True)
+        text = f"clock {offset} from the joints', {milliseconds(bound)} are allowed"
         return ERROR, text, values
     if s.reason:
         return WARN, s.reason, values
@@ -172,5 +174,5 @@ def _status(
 ) -> DiagnosticStatus:
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(
-        name=f"{name}: {part}", hardware_id=robot, level=level, message=message[:1000], values=pairs
+        name=f"{name}: {part}", hardware_id=robot, level=level, message=cut(message), values=pairs
     )

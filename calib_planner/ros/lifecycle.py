@@ -34,9 +34,10 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from calib_planner.errors import CalibPlannerError, UnknownNameError
-from calib_planner.ros.lasting import LastingActionServer, lasting
 from calib_planner.ros.parameters import QOS, NodeParameters, parameter
 from calib_planner.ros.qos import REQUESTS, overridable, own
+from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
+from calib_planner.units import cut
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -223,7 +224,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         for name in self._parameter_overrides:
             if name.startswith(QOS) and not self.has_parameter(name) and "/parameter_events" not in name:
                 valid = sorted(n for n in self._parameters if n.startswith(QOS))
-                self.get_logger().warning(f"{UnknownNameError('parameter', name[:200], valid)}")
+                self.get_logger().warning(f"{UnknownNameError('parameter', cut(name, 200), valid)}")
 
     # ── what is made in a transition is destroyed on the way back ────────────────────────────────────
 
@@ -319,7 +320,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         """As rclpy's; an unknown name is refused with the closest valid one instead of an exception."""
         for given in parameter_list:
             if given.name not in self._parameters:
-                error = UnknownNameError("parameter", given.name[:100], self.settings.names)
+                error = UnknownNameError("parameter", cut(given.name, 100), self.settings.names)
                 return SetParametersResult(successful=False, reason=str(error))
         return super().set_parameters_atomically(parameter_list)
 
@@ -339,5 +340,4 @@ def failed(kind: Any, reason: str) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    text = str(error) if isinstance(error, CalibPlannerError) else f"{type(error).__name__}: {error}"
-    return text if len(text) <= 1000 else f"{text[:480]} … {text[-480:]}"
+    return cut(str(error) if isinstance(error, CalibPlannerError) else f"{type(error).__name__}: {error}")

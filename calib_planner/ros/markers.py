@@ -15,11 +15,10 @@ from geometry_msgs.msg import Point, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.design.plan import Plan
-from calib_planner.robot.capsules import segments
-from calib_planner.robot.chain import Robot
-from calib_planner.ros.conversions import stamp_message
+from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot, segments
+from calib_planner.ros.messages import stamp_message
 
 MOST_SHOWN = 50
 """Configurations, and test poses, that are drawn at most."""

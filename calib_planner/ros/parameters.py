@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.units import brief, cut
 
 P = TypeVar("P")
 
@@ -118,7 +119,7 @@ def check_value(item: Field[Any], given: Parameter) -> None:
     data, value = item.metadata, given.value
     if given.type_ != kind:
         advice = f"write {value}.0" if type(value) is int and kind == Parameter.Type.DOUBLE else ""
-        raise InputError(item.name, f"{_shown(value)} ({given.type_.name.lower()})", words, advice)
+        raise InputError(item.name, f"{brief(value)} ({given.type_.name.lower()})", words, advice)
     low, high = data["low"], data["high"]
     if low is not None and not low <= value <= high:
         unit = f" {data['unit']}" if data["unit"] else ""
@@ -131,7 +132,7 @@ def check_value(item: Field[Any], given: Parameter) -> None:
     if any(len(text) > LONGEST_TEXT for text in texts):
         raise InputError(item.name, f"{max(map(len, texts))} characters", f"at most {LONGEST_TEXT}")
     if data["choices"] and value not in data["choices"]:
-        raise UnknownNameError(item.name, value[:100], data["choices"])
+        raise UnknownNameError(item.name, cut(value, 100), data["choices"])
 
 
 def check_names(given: Mapping[str, Parameter], valid: Sequence[str], declared: Sequence[str]) -> None:
@@ -143,7 +144,7 @@ def check_names(given: Mapping[str, Parameter], valid: Sequence[str], declared: 
     known = {*valid, *declared, *BUILT_IN}
     for name in given:
         if name not in known and not name.startswith(QOS):
-            raise UnknownNameError("parameter", name[:100], sorted([*valid, "use_sim_time"]))
+            raise UnknownNameError("parameter", cut(name, 100), sorted([*valid, "use_sim_time"]))
 
 
 class NodeParameters(Generic[P]):
@@ -192,7 +193,7 @@ class NodeParameters(Generic[P]):
         check_value(item, change)
         if item.metadata["at_configure"] and self.in_use and self._own([change])[item.name] != self._now(item):
             advice = "first the transitions deactivate and cleanup, then configure and activate"
-            raise InputError(item.name, _shown(change.value), "no change while the node is configured", advice)
+            raise InputError(item.name, brief(change.value), "no change while the node is configured", advice)
 
     def _now(self, item: Field[Any]) -> Any:
         return getattr(self.value, item.name)
@@ -202,10 +203,6 @@ class NodeParameters(Generic[P]):
 
     def _own(self, changes: list[Parameter]) -> dict[str, Any]:
         return _plain({c.name: c.value for c in changes if c.name in self._items})
-
-
-def _shown(value: object) -> str:
-    return repr(value)[:100]
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

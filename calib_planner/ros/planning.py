@@ -14,19 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
-from calib_planner.design.discrepancy import ModelDiscrepancy
-from calib_planner.design.feasibility import Constraint
-from calib_planner.design.plan import Plan
-from calib_planner.design.planner import Progress, plan
-from calib_planner.design.problem import PlanProblem
+from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.files.constraints_yaml import read_constraints
-from calib_planner.robot.catalogue import config_folder
-from calib_planner.robot.chain import Robot
-from calib_planner.ros.conversions import check_rows
-from calib_planner.ros.model_source import Model, NotReady, shipped_model
+from calib_planner.io import config_folder, read_constraints
+from calib_planner.planning import Constraint, ModelDiscrepancy, Plan, PlanProblem, Progress, plan
+from calib_planner.robot import Robot
+from calib_planner.ros.messages import check_rows
+from calib_planner.ros.model import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, unknown_words
+from calib_planner.units import brief, cut
 
 MOST_PARAMETERS = 1000
 SMALLEST_SIGMA = 1e-9
@@ -69,13 +65,13 @@ def answer(
         model = _model(request, settings, own)
         found = plan(problem_of(request, settings, model), callback)
     except NotReady as error:
-        return Answer("NOT_READY", "robot", _shortened(str(error)))
+        return Answer("NOT_READY", "robot", cut(error))
     except InputError as error:
         field = re.match(r"\w*", error.field)
         name = field[0] if field else ""
-        return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), _shortened(str(error)))
+        return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), cut(error))
     except InfeasibleError as error:
-        return Answer("INFEASIBLE", _shortened(error.constraint), _shortened(str(error)))
+        return Answer("INFEASIBLE", cut(error.constraint), cut(error))
     if found.status == "singular":
         return Answer("INFEASIBLE", "configurations", found.message)
     status = "CANCELLED" if found.status == "cancelled" else "SUCCESS"
@@ -148,7 +144,7 @@ def file_in(folder: Path, name: str, field: str) -> Path:
     path = folder / Path(name).name
     plain = bool(name) and path.name == name and name not in (".", "..") and "\0" not in name
     if not plain or path.resolve().parent != folder.resolve() or not path.is_file():
-        raise InputError(field, ascii(name[:100]), f"the name of a file in {folder}")
+        raise InputError(field, brief(name, 100), f"the name of a file in {folder}")
     return path
 
 
@@ -188,8 +184,3 @@ def _model(request: Any, settings: PlannerParameters, own: Model | NotReady) -> 
     if not request.robot and isinstance(own, NotReady):
         raise own
     return shipped_model(request.robot, wanted, settings.unknown)
-
-
-def _shortened(text: str) -> str:
-    """``text`` without the middle, if what came over the wire made it very long."""
-    return text if len(text) <= 1000 else f"{text[:480]} … {text[-480:]}"

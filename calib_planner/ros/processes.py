@@ -113,7 +113,7 @@ class Nodes:
         }
 
     def start(self, module: str, parameters: Mapping[str, object] | None = None) -> None:
-        """Start ``calib_planner.ros.MODULE`` with node parameters."""
+        """Start a node by the name of its executable (``planner_node`` …), with node parameters."""
         command = [sys.executable, "-m", "calib_planner.ros.child", module, "--ros-args"]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={value}"]
@@ -208,5 +208,5 @@ def _undisturbed() -> Iterator[None]:
 
 
 def node_names() -> Sequence[str]:
-    """Modules of all nodes of this package."""
+    """Executables of all nodes of this package."""
     return ("planner_node", "identifier_node", "simulator_node", "campaign_node")

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from calib_planner.design.criteria import CRITERIA
+from calib_planner.acquisition import StandstillSettings
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.instrument.standstill import StandstillSettings
-from calib_planner.robot.catalogue import config_folder, shipped_robots
-from calib_planner.robot.chain import Robot
+from calib_planner.io import config_folder, shipped_robots
+from calib_planner.planning import CRITERIA
+from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import LifecycleParameters
-from calib_planner.ros.parameters import parameter
-from calib_planner.simulation.faults import Faults
+from calib_planner.ros.parameters import constraints_text, parameter
+from calib_planner.simulation import Faults
+from calib_planner.units import cut
 
 ROBOT = "shipped robot name"
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas"
@@ -66,7 +68,7 @@ class PlannerParameters(LifecycleParameters):
     def __post_init__(self) -> None:
         for word in unknown_words(self.unknown):
             if word not in ("base", "tool"):
-                raise UnknownNameError("unknown", word[:100], ("base", "tool"))
+                raise UnknownNameError("unknown", cut(word, 100), ("base", "tool"))
 
 
 @dataclass(frozen=True)
@@ -303,7 +305,7 @@ class CampaignParameters(LifecycleParameters):
     def __post_init__(self) -> None:
         for word in unknown_words(self.unknown):
             if word not in ("base", "tool"):
-                raise UnknownNameError("unknown", word[:100], ("base", "tool"))
+                raise UnknownNameError("unknown", cut(word, 100), ("base", "tool"))
         if self.budget <= self.validation:
             raise InputError("budget", self.budget, f"more than validation, which is {self.validation}")
         _ = self.test_pose_rows
@@ -318,7 +320,8 @@ class CampaignParameters(LifecycleParameters):
             except ValueError:
                 row = (float("nan"),)
             if not np.isfinite(row).all():
-                raise InputError("test_poses", text[:100], "numbers with spaces between, poses with semicolons")
+                expected = "numbers with spaces between, poses with semicolons"
+                raise InputError("test_poses", cut(text, 100), expected)
             rows.append(row)
         return tuple(rows)
 
@@ -350,3 +353,62 @@ def with_topics(robot: Robot, topics: int | None, unknown: str) -> Robot:
         expected = f"{len(robot.targets)} topics, as the robot has targets"
         raise InputError("tracker_topics", f"{topics} topics", expected, "or set unknown to tool")
     return robot.with_targets(np.zeros((topics, 3)))
+
+
+# ── The files ``config/*.yaml`` of the nodes: written from the dataclasses, so that both say the same ───────
+#     python -m calib_planner.ros.settings
+#
+# writes them again after a parameter was added; a test compares.
+
+NODES: dict[str, tuple[type[Any], str]] = {
+    "planner": (PlannerParameters, "calibration_planner"),
+    "identifier": (IdentifierParameters, "calibration_identifier"),
+    "simulator": (SimulatorParameters, "tracker_simulator"),
+    "campaign": (CampaignParameters, "calibration_campaign"),
+}
+"""Name of the file → the parameters and the node's name."""
+
+
+def yaml_text(name: str) -> str:
+    """The text of ``config/NAME.yaml``: every parameter at its default, with its description."""
+    kind, node = NODES[name]
+    lines = [
+        f"# Parameters of the node {node} ({name}_node): every one there is, at its default.",
+        f"# Use: python -m calib_planner.ros.nodes.{name} --ros-args --params-file config/{name}.yaml",
+        "/**:",
+        "  ros__parameters:",
+    ]
+    for item in fields(kind):
+        lines += [f"    # {_comment(item)}", f"    {item.name}: {_value(item.default)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _comment(item: Field[Any]) -> str:
+    unit = f" [{item.metadata['unit']}]" if item.metadata["unit"] else ""
+    limits = constraints_text(item)
+    return item.metadata["description"] + unit + (f"; {limits}" if limits else "")
+
+
+def _value(value: Any) -> str:
+    """As YAML that ROS reads with the right type: 3e-05 would be a text."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(value) + "]"
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, float):
+        text = f"{value:.12f}".rstrip("0")
+        return text + "0" if text.endswith(".") else text
+    return str(value)
+
+
+def main() -> int:
+    """Write the files."""
+    for name in NODES:
+        (config_folder() / f"{name}.yaml").write_text(yaml_text(name), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

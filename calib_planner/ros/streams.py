@@ -13,11 +13,7 @@ import numpy as np
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import JointState
 
-from calib_planner._arrays import FloatArray
-from calib_planner.errors import InputError
-from calib_planner.files.campaign_records import LONGEST
-from calib_planner.instrument.joint_state import pick_joints
-from calib_planner.instrument.standstill import (
+from calib_planner.acquisition import (
     IN_A_ROW,
     NANO,
     Reason,
@@ -25,9 +21,14 @@ from calib_planner.instrument.standstill import (
     Standstill,
     StandstillDetector,
     StandstillSettings,
+    pick_joints,
 )
-from calib_planner.ros.conversions import nanoseconds
+from calib_planner.arrays import FloatArray
+from calib_planner.errors import InputError
+from calib_planner.io import LONGEST
 from calib_planner.ros.diagnostics import StreamHealth
+from calib_planner.ros.messages import nanoseconds
+from calib_planner.units import brief
 
 
 class JointReader:
@@ -159,7 +160,7 @@ class Intake:
         if not watch.usable(stamp) or self.detector is None:
             return []
         if frame and frame != self.frame and not self._enter_frame(frame[:LONGEST]):
-            other = f"frame_id {frame[:40]!r}, the points before are in {self.frame[:40]!r}"
+            other = f"frame_id {brief(frame, 40)}, the points before are in {brief(self.frame, 40)}"
             self._other_frame[target] = f"{other}: publish all in one frame, or call ~/reset"
             watch.refuse(self._other_frame[target])
             return []

@@ -2,23 +2,6 @@
 
 from calib_planner.simulation.cell import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
 from calib_planner.simulation.faults import Faults
-from calib_planner.simulation.motion import Itinerary, Stand, Tour, make_tour
+from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour, make_tour
 from calib_planner.simulation.streams import Message, Rates, Streams, play
-from calib_planner.simulation.world import World
-
-__all__ = [
-    "ANGLE_ERROR",
-    "LENGTH_ERROR",
-    "Faults",
-    "Itinerary",
-    "Message",
-    "Rates",
-    "SimulatedCell",
-    "Stand",
-    "Streams",
-    "Tour",
-    "World",
-    "make_tour",
-    "play",
-    "random_deviations",
-]
+from calib_planner.simulation.world import World, simulated

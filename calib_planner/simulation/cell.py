@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner._arrays import FloatArray, check_configurations, check_count, check_number
+from calib_planner.arrays import FloatArray, check_configurations, check_count, check_number
 from calib_planner.errors import InputError
-from calib_planner.identification.measurements import Measurements
-from calib_planner.instrument.noise import Noise
-from calib_planner.robot.chain import Robot
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
+from calib_planner.tracker import Noise
 
 LENGTH_ERROR = 1e-3
 """Default standard deviation of true length errors [m]."""
@@ -87,3 +88,38 @@ class SimulatedCell:
         """(N, targets) distances between the true robot and ``model``, eq. (4) [m]."""
         difference = self.truth.positions(configurations) - model.positions(configurations)
         return np.linalg.norm(difference, axis=2)
+
+
+# ── One stream of random numbers per purpose: switching a fault on changes no other draw ────────────────────
+
+
+class Purpose(IntEnum):
+    """What is drawn; part of the seed, so the numbers stay as they are."""
+
+    NOISE = 101
+    TRANSMISSION = 102
+    UNSETTLED = 103
+    RESEAT = 104
+    DRIFT = 105
+    BUMP = 106
+    OUTLIER = 107
+    OUTLIER_SIZE = 108
+    OUTLIER_STANDSTILL = 109
+    BEAM_BREAK = 110
+    DROPOUT = 111
+    DELAY = 112
+    DUPLICATE = 113
+    DUPLICATE_DELAY = 114
+    REORDER = 115
+    REORDER_DELAY = 116
+
+
+def draws(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
+    """The generator of a purpose, and of the arrival or stream ``which``."""
+    return np.random.default_rng([seed, int(purpose), *which])
+
+
+def directions(rng: np.random.Generator, count: int) -> FloatArray:
+    """(count, 3) unit vectors, uniform on the sphere."""
+    raw = rng.standard_normal((count, 3))
+    return np.asarray(raw / np.linalg.norm(raw, axis=1)[:, None])

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from calib_planner._arrays import check_count, check_number
+from calib_planner.arrays import check_count, check_number
 from calib_planner.errors import InputError
 
 NEVER = -1

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray, IntArray, frozen
+from calib_planner.arrays import FloatArray, IntArray, frozen
 
 NANO = 1_000_000_000
 

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray, IntArray, check_number
-from calib_planner.simulation.draws import Purpose, draws
+from calib_planner.arrays import FloatArray, IntArray, check_number
+from calib_planner.simulation.cell import Purpose, draws
 from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour
-from calib_planner.simulation.sight import Sight
-from calib_planner.simulation.world import World
+from calib_planner.simulation.world import Sight, World
 
 LONGEST_STEP = 1.0
 """Time that is made up for when nobody asked for longer; beyond that the streams begin anew [s]."""

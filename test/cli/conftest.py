@@ -10,7 +10,7 @@ import pytest
 from identify_runs import Run, small_data
 
 from calib_planner.cli import main
-from calib_planner.files.measurements_csv import write_measurements
+from calib_planner.io import write_measurements
 
 
 @pytest.fixture

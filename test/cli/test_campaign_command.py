@@ -11,10 +11,8 @@ import pytest
 
 from calib_planner import Robot
 from calib_planner.cli import main
-from calib_planner.files.configurations_csv import read_plan_csv
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.measurements_csv import read_measurements, write_measurements
-from calib_planner.identification.measurements import Measurements
+from calib_planner.io import read_estimate, read_measurements, read_plan_csv, write_measurements
+from calib_planner.measurements import Measurements
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 POSE = ["--test-pose", "0.17453 0.87266"]

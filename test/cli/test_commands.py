@@ -15,8 +15,7 @@ from robots import SHARED_DATA
 
 from calib_planner import Robot, __version__
 from calib_planner.cli import main
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.plan_yaml import read_plan
+from calib_planner.io import read_estimate, read_plan
 
 POSE = "0 -60 90 0 45 0"
 PLAN = ["plan", "--robot", "kuka_kr270", "--degrees", "--test-pose", POSE, "--starts", "8"]

@@ -12,10 +12,8 @@ from robots import MIXED_URDF
 
 from calib_planner import Robot
 from calib_planner.cli import main
-from calib_planner.files.calibrated_robot import calibrated_robot
-from calib_planner.files.configurations_csv import read_configurations
-from calib_planner.files.document import write_document
-from calib_planner.files.estimate_yaml import read_estimate
+from calib_planner.io import calibrated_robot, read_configurations, read_estimate
+from calib_planner.io.yaml import write_document
 
 OFFSETS = {"turn.offset": 1e-3, "slide.offset": -2e-3, "spin.offset": 5e-3, "nod.offset": -4e-3}
 Q = [[0.1, 0.2, 0.3, 0.4], [-0.5, 0.0, 2.0, -0.6]]

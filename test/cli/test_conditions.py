@@ -9,8 +9,8 @@ import numpy as np
 
 from calib_planner import Robot
 from calib_planner.cli import main
-from calib_planner.design.feasibility import Feasibility
-from calib_planner.files.constraints_yaml import read_constraints
+from calib_planner.io import read_constraints
+from calib_planner.planning import Feasibility
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 PLAN = ["plan", "--robot", "kuka_kr270", "--degrees", "--test-pose", "0 -60 90 0 45 0", "--starts", "4"]

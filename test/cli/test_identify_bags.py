@@ -9,10 +9,8 @@ import pytest
 from identify_runs import Run, fails
 
 from calib_planner import Robot
-from calib_planner.files.bag import read_bag
-from calib_planner.files.bag_storage import BagTopics
-from calib_planner.files.measurements_csv import write_measurements
-from calib_planner.instrument.standstill import StandstillSettings
+from calib_planner.acquisition import StandstillSettings
+from calib_planner.io import BagTopics, read_bag, write_measurements
 from calib_planner.simulation import SimulatedCell
 
 
@@ -20,7 +18,7 @@ from calib_planner.simulation import SimulatedCell
 def bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """planar_2r at eight stops, on topics of its own."""
     pytest.importorskip("rosbags")
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "files"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "io"))
     from bags import campaign, write_bag
 
     cell = SimulatedCell(Robot.load("planar_2r"), {"l1": 1e-3, "dq2": -2e-3})

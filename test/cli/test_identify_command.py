@@ -12,10 +12,10 @@ from identify_runs import Run, fails, small_data
 from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations
 
 from calib_planner import Measurements, Robot
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.kinematics_yaml import read_kinematics
-from calib_planner.files.measurements_csv import write_measurements
+from calib_planner.io import read_estimate, write_measurements
+from calib_planner.io.kinematics import read_kinematics
 from calib_planner.simulation import SimulatedCell
+from calib_planner.units import length
 
 PLAIN = ("--discrepancy", "off", "--joint-corrections", "off", "--starts", "0")
 """The paper's white noise alone, so that the results of two ways can be compared."""
@@ -67,7 +67,7 @@ def test_the_verdict_comes_first_and_fail_is_an_answer(run: Run, points: Path, t
     out, err = run(*words, shown=True)
     assert out.startswith("PASS") and "nothing was held out" in out and str(output) in err
     out, _ = run(*words, "--required-accuracy", 1e-9, shown=True)
-    assert out.startswith("FAIL") and "1e-06 mm are required" in out and "required: 0.001 µm" in out
+    assert out.startswith("FAIL") and "0.001 µm are required" in out and "required: 0.001 µm" in out
     assert out.index("FAIL") < out.index("mean before") < out.index("Noise") < out.index("± std")
     saved = read_estimate(output)
     assert saved.verdict is not None and saved.verdict.level == "FAIL"
@@ -89,7 +89,8 @@ def test_rejected_points_are_found_in_their_file(run: Run, points: Path, tmp_pat
     assert result["measurements"] == 42 and result["used"] == 41
     assert result["data"] == [{"file": str(points), "rows": 12}, {"file": str(other), "rows": 30}]
     out, _ = run(*words, shown=True)
-    assert f"row 16, target 1 (line 8 of {other}): " in out and "50 mm off" in out
+    off = result["rejected"][0]["residual"]
+    assert off == pytest.approx(0.05, abs=1e-4) and f"{length(off)} off" in out
     assert "41 points of 42" in out
 
 

@@ -15,9 +15,8 @@ from robots import MIXED_URDF, mixed, plan_of, random_configurations
 from calib_planner import Robot
 from calib_planner.cli import main
 from calib_planner.cli.sheet import FILES
-from calib_planner.design.plan_sheet import plan_identity
-from calib_planner.files.configurations_csv import read_plan_csv
-from calib_planner.files.plan_yaml import read_plan, write_plan
+from calib_planner.io import read_plan, read_plan_csv, write_plan
+from calib_planner.planning.sheet import plan_identity
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from calib_planner import IdentificationProblem, Measurements, Robot
-from calib_planner.identification.solver import start_robot
+from calib_planner.identification import start_robot
 from calib_planner.robot.elements import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 

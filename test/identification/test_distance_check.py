@@ -8,10 +8,8 @@ from cells import ROUND, SIGMA, WrongRobot, bare, placed_cell, plain_cell
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
-from calib_planner.identification.distance_check import check_distances
-from calib_planner.identification.equations import Equations, point_whitening
-from calib_planner.identification.least_squares import gauss_newton
-from calib_planner.identification.order_check import Disturbance, instead_of_discrepancy
+from calib_planner.identification.checks import Disturbance, check_distances, instead_of_discrepancy
+from calib_planner.identification.least_squares import Equations, gauss_newton, point_whitening
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KUKA = Robot.load("kuka_kr270")

@@ -11,11 +11,9 @@ from cells import POSE, ROUND, WrongRobot, bare
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
-from calib_planner.identification.accumulator import Accumulator
-from calib_planner.identification.hidden_errors import LENGTH, TYPICAL
-from calib_planner.identification.noise_levels import DOUBT
+from calib_planner.identification import DOUBT, UPDATE, JointCorrections, phases
+from calib_planner.identification.checks import LENGTH, TYPICAL
 from calib_planner.identification.transmission import spectrum
-from calib_planner.robot.joint_corrections import JointCorrections, phases
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KUKA = Robot.load("kuka_kr270")
@@ -77,8 +75,8 @@ def test_not_where_the_data_would_show_them():
     )
     assert learnt.transmission is not None and learnt.hidden is None
     assert found(measured(ROUND, 1), joint_corrections="off").hidden is None
-    streamed = Accumulator.begin(KUKA, sigma=NOISE).with_measurements(measured(ROUND, 1))
-    assert streamed.estimate is not None and streamed.estimate.hidden is None
+    quick = identify(IdentificationProblem(KUKA, measured(ROUND, 1), sigma=NOISE, **UPDATE))
+    assert quick.hidden is None
 
 
 def test_residuals_that_tell_their_own_scatter_rule_out_larger_ones():

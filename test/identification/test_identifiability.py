@@ -11,9 +11,9 @@ from cells import SIGMA, bare
 from robots import CASES, mixed, random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
-from calib_planner.design.identifiability import analyse, describe
 from calib_planner.errors import CalibPlannerError
-from calib_planner.identification.prior import Prior, typical_prior
+from calib_planner.identification import Prior, typical_prior
+from calib_planner.robot import analyse, describe
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 UNKNOWN = {"": (), " base": ("base",), " base tool": ("base", "tool")}

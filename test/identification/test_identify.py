@@ -19,7 +19,7 @@ from calib_planner import (
     identify,
     validate,
 )
-from calib_planner.identification.discrepancy import fit_discrepancy
+from calib_planner.identification.noise_levels import fit_discrepancy
 from calib_planner.identification.registration import register
 from calib_planner.robot.elements import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations

@@ -7,7 +7,7 @@ import pytest
 from robots import random_configurations
 
 from calib_planner import Robot
-from calib_planner.identification.motion import MOST_PLACES, Motion
+from calib_planner.identification.least_squares import MOST_PLACES, Motion
 
 ROUNDING = 1e-14
 TARGETS = [[0.1, 0.0, 0.2], [0.0, 0.15, 0.1]]

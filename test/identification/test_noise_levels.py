@@ -10,22 +10,15 @@ from scipy.linalg import block_diag
 from scipy.stats import binom
 
 from calib_planner import IdentificationProblem, Measurements, identify
-from calib_planner.identification.equations import (
+from calib_planner.identification import DOUBT, NoiseLevels, configuration_labels, improbable
+from calib_planner.identification.least_squares import (
     Equations,
     block_whitening,
     configuration_blocks,
-    configuration_labels,
     point_whitening,
 )
-from calib_planner.identification.noise_levels import (
-    DOUBT,
-    DiscrepancyModel,
-    NoiseLevels,
-    estimate_variances,
-    improbable,
-    repeat_scatter,
-)
-from calib_planner.instrument.noise import LaserTracker
+from calib_planner.identification.noise_levels import DiscrepancyModel, estimate_variances, repeat_scatter
+from calib_planner.tracker import LaserTracker
 
 QUIET = {"starts": 0, "joint_corrections": "off"}
 

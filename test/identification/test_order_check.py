@@ -7,15 +7,14 @@ import pytest
 
 from calib_planner import Measurements, Robot
 from calib_planner.errors import InputError
-from calib_planner.identification.equations import Equations, configuration_labels, point_whitening
-from calib_planner.identification.least_squares import gauss_newton
-from calib_planner.identification.noise_levels import NoiseLevels
-from calib_planner.identification.order_check import (
+from calib_planner.identification import NoiseLevels, configuration_labels
+from calib_planner.identification.checks import (
     Disturbance,
     check_order,
     rejected_since,
     wholly_whitened,
 )
+from calib_planner.identification.least_squares import Equations, gauss_newton, point_whitening
 from calib_planner.simulation import random_deviations
 
 SIGMA = 1e-5

@@ -11,9 +11,10 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from calib_planner import IdentificationProblem, InputError, Robot, UnknownNameError, identify
-from calib_planner.identification.prior import ANGLE_STD, LENGTH_STD, OFFSET_STD, Prior, typical_prior
-from calib_planner.instrument.noise import LaserTracker
+from calib_planner.identification import Prior, typical_prior
+from calib_planner.identification.problem import ANGLE_STD, LENGTH_STD, OFFSET_STD
 from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.tracker import LaserTracker
 
 TRACKER = LaserTracker(station=np.array([6.0, -2.0, 1.0]), azimuth=1.5e-5, elevation=3e-5)
 

@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2
 
 from calib_planner import IdentificationProblem, NotEnoughDataError, Robot, identify
 from calib_planner.identification.robust import gate_of, robust_registration
-from calib_planner.robot.chain import Robot as Chain
+from calib_planner.robot import Robot as Chain
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 NOISE = {"known": {"sigma": SIGMA}, "unknown": {}}

@@ -9,8 +9,8 @@ from robots import mixed, random_configurations
 from scipy.stats import binom
 
 from calib_planner import Robot
-from calib_planner.identification.equations import configuration_labels
-from calib_planner.identification.structure import FEWEST, residual_structure
+from calib_planner.identification import FEWEST, configuration_labels
+from calib_planner.identification.checks import residual_structure
 
 ROBOTS = {
     "kuka": lambda: Robot.load("kuka_kr270").with_targets(TARGETS),

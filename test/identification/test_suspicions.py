@@ -10,7 +10,8 @@ from cells import SIGMA, TARGETS, bare, placed_cell, plain_cell
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, InputError, Robot, identify
-from calib_planner.identification.suspicions import check_units, copied_rows, explain
+from calib_planner.identification import check_units
+from calib_planner.identification.checks import copied_rows, explain
 
 
 @pytest.mark.parametrize("make", [plain_cell, placed_cell], ids=["plain", "placed"])

@@ -9,11 +9,10 @@ import pytest
 from robots import SHARED_DATA, mixed, random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify, validate
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.identification.robust import normalised
+from calib_planner.identification import JointCorrections, cross_validate, normalised, phases
 from calib_planner.identification.transmission import TAIL, kernel, spectrum
-from calib_planner.identification.validation import INSIDE, cross_validate
-from calib_planner.robot.joint_corrections import JointCorrections, phases
+from calib_planner.identification.validation import INSIDE
+from calib_planner.io import read_measurements
 
 SIGMA = 2e-5
 

@@ -10,7 +10,7 @@ from cells import SIGMA, WrongRobot, bare, placed_cell, plain_cell, spoil
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, InputError, Measurements, NotEnoughDataError, identify, validate
-from calib_planner.identification.validation import cross_validate
+from calib_planner.identification import cross_validate
 from calib_planner.simulation import SimulatedCell
 
 

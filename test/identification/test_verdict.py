@@ -13,9 +13,8 @@ from cells import POSE, ROUND, SIGMA, WrongRobot, bare, placed_cell, plain_cell,
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Robot, identify, validate
-from calib_planner.identification import verdict as module
-from calib_planner.identification.validation import cross_validate
-from calib_planner.identification.verdict import LEVELS
+from calib_planner.identification import LEVELS, cross_validate
+from calib_planner.identification import estimate as module
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KUKA = Robot.load("kuka_kr270")

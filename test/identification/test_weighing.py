@@ -7,8 +7,7 @@ import pytest
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot
-from calib_planner.identification.weighing import weigh
-from calib_planner.identification.work import Work
+from calib_planner.identification.weighing import Work, weigh
 
 SIGMA = 2e-5
 TARGETS = [[0.1, 0.0, 0.2], [0.0, 0.15, 0.1]]

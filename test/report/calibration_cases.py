@@ -11,8 +11,8 @@ from robots import mixed, random_configurations
 from scipy.spatial.transform import Rotation
 
 from calib_planner import Estimate, IdentificationProblem, Measurements, Robot, identify, validate
-from calib_planner.identification.validation import cross_validate
-from calib_planner.report.provenance import Provenance
+from calib_planner.identification import cross_validate
+from calib_planner.report import Provenance
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 BASE = Rotation.from_rotvec([0.1, -0.2, 2.0]).as_matrix(), np.array([2.5, -1.5, 0.4])

@@ -12,7 +12,7 @@ import pytest
 from browser import Browser, Tab, browser
 from calibration_cases import CASES, Case, hostile, kuka, outliers
 
-from calib_planner.report.calibration_report import write_report
+from calib_planner.report import write_report
 
 ALL = {**CASES, "hostile": lambda: hostile()[0]}
 HELP = """

@@ -17,11 +17,12 @@ from robots import SHARED_DATA, random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.report.calibration_charts import MOST_DOTS, drawn_points, joint_residuals
-from calib_planner.report.calibration_page import report_page
-from calib_planner.report.calibration_report import calibration_report, write_report
-from calib_planner.report.provenance import provenance, sha256_of
+from calib_planner.io import read_measurements
+from calib_planner.report import provenance, write_report
+from calib_planner.report.calibration import calibration_report
+from calib_planner.report.charts import MOST_DOTS, drawn_points, joint_residuals
+from calib_planner.report.page import report_page
+from calib_planner.report.provenance import sha256_of
 from calib_planner.report.scene import MOST_ROBOTS, REJECTED, thinned
 from calib_planner.simulation import random_deviations
 

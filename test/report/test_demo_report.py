@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from calib_planner import IdentificationProblem, PlanProblem, Robot, identify, plan
+from calib_planner.demo import DemoResult, demo_report, draw, print_table
 from calib_planner.errors import InputError
-from calib_planner.report.demo_report import DemoResult, demo_report, draw, print_table
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 

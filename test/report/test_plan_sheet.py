@@ -12,12 +12,11 @@ from robots import mixed, plan_of, random_configurations
 from scipy.spatial.transform import Rotation
 
 from calib_planner import Robot
-from calib_planner.design.constraints import Custom, ReflectorAcceptance, TrackerRange
-from calib_planner.design.plan_sheet import plan_sheet
-from calib_planner.instrument.noise import LaserTracker
-from calib_planner.report.plan_sheet_page import BOXES, sheet_page
-from calib_planner.report.posture_svg import posture_drawings
-from calib_planner.report.quantities import duration, length, signed
+from calib_planner.planning import ReflectorAcceptance, TrackerRange, plan_sheet
+from calib_planner.planning.constraints import Custom
+from calib_planner.report.plan_sheet import BOXES, posture_drawings, sheet_page
+from calib_planner.tracker import LaserTracker
+from calib_planner.units import duration, length, signed
 
 STATION = np.array([4.0, 1.5, 1.2])
 VOID = {"meta", "link", "col", "br", "input", "path", "rect", "circle", "polyline"}

@@ -9,7 +9,7 @@ import pytest
 from robots import mixed, random_configurations
 
 from calib_planner import FileFormatError, InputError, Robot, UnknownNameError
-from calib_planner.robot.catalogue import shipped_robots
+from calib_planner.io import shipped_robots
 from calib_planner.robot.elements import rotation
 
 

@@ -10,7 +10,7 @@ from robots import random_configurations
 
 from calib_planner import FileFormatError, InputError, Robot, UnknownNameError
 from calib_planner.cli import main
-from calib_planner.robot.urdf import parse_urdf
+from calib_planner.io import parse_urdf
 
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
 

@@ -25,7 +25,7 @@ from rclpy.qos import QoSProfile
 
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.processes import own_domain
-from calib_planner.ros.run import spin_once
+from calib_planner.ros.rclpy_ext.run import spin_once
 
 
 def overrides(values: Mapping[str, Any]) -> list[Parameter]:

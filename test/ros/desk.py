@@ -8,7 +8,7 @@ from bench import Bench
 from calib_planner_msgs.msg import CampaignStatus
 from std_srvs.srv import Trigger
 
-from calib_planner.ros.campaign_node import CampaignNode
+from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.qos import LATCHED
 
 NAME = "calibration_campaign"

@@ -19,9 +19,9 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from calib_planner import Robot
-from calib_planner.ros.conversions import plan_from_message
-from calib_planner.ros.lasting import LastingActionServer
+from calib_planner.ros.messages import plan_from_message
 from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.rclpy_ext.lasting import LastingActionServer
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 Answer = Callable[[np.ndarray], str]

@@ -15,9 +15,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from calib_planner import Plan, Robot
-from calib_planner.instrument.standstill import NANO
-from calib_planner.ros.conversions import plan_to_message, point_message, stamp_message
-from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.acquisition import NANO
+from calib_planner.ros.messages import plan_to_message, point_message, stamp_message
+from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_OUT
 from calib_planner.simulation import random_deviations
 

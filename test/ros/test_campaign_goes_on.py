@@ -16,10 +16,10 @@ import pytest
 from robots import plan_of, random_configurations
 
 from calib_planner import Estimate, Plan, Robot
+from calib_planner.acquisition import NANO, Reason, Rejection, Standstill
 from calib_planner.errors import InputError, StoreError
-from calib_planner.files.campaign_store import CampaignStore, StoredModel, UnavailableStore, open_store
-from calib_planner.instrument.standstill import NANO, Reason, Rejection, Standstill
-from calib_planner.ros.campaign import MOST_REJECTIONS, NOT_STORED, Campaign, Matching, condition_of
+from calib_planner.io import CampaignStore, StoredModel, UnavailableStore, open_store
+from calib_planner.ros.session import MOST_REJECTIONS, NOT_STORED, Campaign, Matching, condition_of
 from calib_planner.simulation import random_deviations
 
 HOW = Matching(sigma=3e-5)
@@ -191,7 +191,7 @@ def test_reset_leaves_the_old_campaign_in_the_store() -> None:
 
 
 def test_rejections_cannot_fill_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib_planner.ros.campaign.MOST_REJECTIONS", 20)
+    monkeypatch.setattr("calib_planner.ros.session.MOST_REJECTIONS", 20)
     assert MOST_REJECTIONS > 20
     campaign = begun(opened(""))
     wrong = Rejection(1, 2, Reason.MOVED, "moved", np.zeros(2), np.array([3]))

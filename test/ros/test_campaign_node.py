@@ -19,15 +19,14 @@ from fake_cell import FakeCell
 from rclpy.parameter import Parameter
 
 from calib_planner import Robot
-from calib_planner.files.campaign_journal import FILE
-from calib_planner.files.estimate_yaml import read_estimate
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.ros import campaign_measuring
-from calib_planner.ros.campaign_node import CampaignNode
-from calib_planner.ros.conversions import estimate_from_message
-from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.io import read_estimate, read_measurements
+from calib_planner.io.journal import FILE
+from calib_planner.ros import campaign as campaign_measuring
+from calib_planner.ros.messages import estimate_from_message
+from calib_planner.ros.nodes.campaign import CampaignNode
+from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.qos import EVENTS, LATCHED
-from calib_planner.ros.simulator_node import SimulatorNode
 from calib_planner.simulation import random_deviations
 
 IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
@@ -80,7 +79,7 @@ def test_a_campaign_with_simulator_and_identifier(bench: Bench, tmp_path: Path) 
 
 
 def simulator_process(folder: Path, domain: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "calib_planner.ros.simulator_node", "--ros-args"]
+    command = [sys.executable, "-m", "calib_planner.ros.nodes.simulator", "--ros-args"]
     for name, value in SIMULATOR.items():
         command += ["-p", f"{name}:={value}"]
     environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -12,7 +12,7 @@ from bench import Bench
 from desk import ASKED, Desk, S
 from fake_cell import FakeCell
 
-from calib_planner.files.campaign_journal import FILE
+from calib_planner.io.journal import FILE
 from calib_planner.ros.processes import Nodes
 
 NODE = "campaign_node"

@@ -9,7 +9,7 @@ from calib_planner_msgs.msg import Measurement
 from desk import Desk, S
 from fake_cell import FakeCell
 
-from calib_planner.ros import campaign_measuring
+from calib_planner.ros import campaign as campaign_measuring
 
 CLOCK = Measurement.REJECTED_CLOCK_OFFSET
 

@@ -27,9 +27,9 @@ from robots import plan_of
 from sensor_msgs.msg import JointState
 
 from calib_planner import Robot
-from calib_planner.instrument.standstill import NANO
-from calib_planner.robot.catalogue import config_folder
-from calib_planner.ros.conversions import nanoseconds, plan_to_message
+from calib_planner.acquisition import NANO
+from calib_planner.io import config_folder
+from calib_planner.ros.messages import nanoseconds, plan_to_message
 from calib_planner.ros.qos import SENSOR_IN
 from calib_planner.ros.settings import SimulatorParameters
 

@@ -13,11 +13,11 @@ from geometry_msgs.msg import Point, PointStamped
 from sensor_msgs.msg import JointState
 
 from calib_planner import IdentificationProblem, Plan, PlanProblem, Robot, identify, plan
-from calib_planner.design.plan import STATUS as LIBRARY_PLAN_STATUS
+from calib_planner.acquisition import Reason, Rejection, Standstill
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification.estimate import STATUS as LIBRARY_ESTIMATE_STATUS
-from calib_planner.instrument.standstill import Reason, Rejection, Standstill
-from calib_planner.ros import conversions as c
+from calib_planner.planning.plan import STATUS as LIBRARY_PLAN_STATUS
+from calib_planner.ros import messages as c
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 

@@ -12,13 +12,12 @@ from sensor_msgs.msg import JointState
 from test_campaign_goes_on import HOW, PLAN, ROBOT, begun, measure, opened, seen
 
 from calib_planner import Estimate
+from calib_planner.acquisition import NANO, Offset, StandstillSettings
 from calib_planner.errors import InputError, StoreError
-from calib_planner.files.campaign_store import StoredModel, UnavailableStore
-from calib_planner.instrument.clock_offset import Offset
-from calib_planner.instrument.standstill import NANO, StandstillSettings
-from calib_planner.ros.campaign import Campaign
-from calib_planner.ros.conversions import joints_message, point_message, stamp_message
+from calib_planner.io import StoredModel, UnavailableStore
 from calib_planner.ros.diagnostics import StreamHealth, diagnostics
+from calib_planner.ros.messages import joints_message, point_message, stamp_message
+from calib_planner.ros.session import Campaign
 from calib_planner.ros.streams import Intake, JointReader, StreamWatch
 
 GOOD = StreamHealth("joint_states", 1000.0, 0.002, 0.0, 5000, 0, 0, 0, "")

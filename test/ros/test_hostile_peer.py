@@ -31,12 +31,12 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner import Plan, Robot
-from calib_planner.ros.conversions import plan_to_message
-from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.planner_node import PlannerNode
+from calib_planner.ros.messages import plan_to_message
+from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.planner import PlannerNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_OUT
-from calib_planner.ros.simulator_node import SimulatorNode
 
 PLANNER, IDENTIFIER, SIMULATOR = "calibration_planner", "calibration_identifier", "tracker_simulator"
 PATHS = (

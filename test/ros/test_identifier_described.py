@@ -15,10 +15,10 @@ from shift import NAME, Shift, change
 from std_msgs.msg import String
 
 from calib_planner import Plan, PlanProblem, Robot, plan
-from calib_planner.instrument.standstill import NANO
-from calib_planner.robot.urdf import parse_urdf
-from calib_planner.ros.conversions import point_message, stamp_message
-from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.acquisition import NANO
+from calib_planner.io import parse_urdf
+from calib_planner.ros.messages import point_message, stamp_message
+from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.qos import LATCHED
 
 

@@ -21,11 +21,10 @@ from robots import plan_of, random_configurations
 from sensor_msgs.msg import JointState
 
 from calib_planner import Robot
-from calib_planner.files.campaign_records import ACCEPTED
-from calib_planner.files.campaign_schema import FILE
-from calib_planner.files.campaign_store import open_store, stored_model
-from calib_planner.instrument.standstill import NANO
-from calib_planner.ros.conversions import joints_message, plan_to_message, point_message
+from calib_planner.acquisition import NANO
+from calib_planner.io import ACCEPTED, open_store, stored_model
+from calib_planner.io.store import FILE
+from calib_planner.ros.messages import joints_message, plan_to_message, point_message
 from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 
@@ -99,7 +98,7 @@ class Feeder:
 
 
 def started(folder: Path, log: Path, domain: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "calib_planner.ros.identifier_node", "--ros-args"]
+    command = [sys.executable, "-m", "calib_planner.ros.nodes.identifier", "--ros-args"]
     for topic in ("joint_states", "tracker/point"):
         command += ["-p", f"qos_overrides./{topic}.subscription.reliability:=reliable"]
     command += ["-p", "robot:=planar_2r", "-p", f"store_folder:={folder}"]

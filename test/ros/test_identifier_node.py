@@ -18,10 +18,10 @@ from shift import NAME, Estimate, Shift, change
 from std_srvs.srv import Trigger
 
 from calib_planner import Plan, PlanProblem, Robot, plan
-from calib_planner.files.campaign_schema import FILE
-from calib_planner.instrument.standstill import NANO
-from calib_planner.ros.conversions import plan_to_message, point_message, stamp_message
-from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.acquisition import NANO
+from calib_planner.io.store import FILE
+from calib_planner.ros.messages import plan_to_message, point_message, stamp_message
+from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.qos import EVENTS, LATCHED
 
 

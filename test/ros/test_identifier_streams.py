@@ -14,8 +14,8 @@ from geometry_msgs.msg import PointStamped
 from test_identifier_node import Shift, change, spread
 
 from calib_planner import Plan, Robot
-from calib_planner.ros.conversions import plan_to_message
-from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.ros.messages import plan_to_message
+from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.qos import EVENTS
 
 CLOCK, FRAME = Measurement.REJECTED_CLOCK_OFFSET, Measurement.REJECTED_OTHER_FRAME

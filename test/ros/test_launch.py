@@ -20,16 +20,16 @@ import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 
-from calib_planner.robot.catalogue import config_folder
-from calib_planner.ros.identifier_node import IdentifierNode
-from calib_planner.ros.planner_node import PlannerNode
+from calib_planner.io import config_folder
+from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.planner import PlannerNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.settings import (
     CampaignParameters,
     IdentifierParameters,
     PlannerParameters,
     SimulatorParameters,
 )
-from calib_planner.ros.simulator_node import SimulatorNode
 
 FOLDER = config_folder().parent / "launch"
 FILES = sorted(FOLDER.glob("*.launch.py"))

@@ -19,13 +19,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner.errors import InputError
-from calib_planner.ros.campaign_node import CampaignNode
-from calib_planner.ros.identifier_node import IdentifierNode
 from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
+from calib_planner.ros.nodes.campaign import CampaignNode
+from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.planner import PlannerNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import parameter
-from calib_planner.ros.planner_node import PlannerNode
 from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_IN
-from calib_planner.ros.simulator_node import SimulatorNode
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from robots import mixed, plan_of, random_configurations
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_planner import Robot
-from calib_planner.design.plan import Plan
 from calib_planner.errors import InputError
-from calib_planner.robot.catalogue import config_folder
+from calib_planner.io import config_folder
+from calib_planner.planning import Plan
 from calib_planner.ros.markers import MOST_SHOWN, plan_markers, skeletons
+from calib_planner.ros.messages import pace_of, trajectory_message
 from calib_planner.ros.settings import PlannerParameters
-from calib_planner.ros.trajectory import pace_of, trajectory_message
 
 STAMP = 1_500_000_000
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from calib_planner import Estimate, Plan, PlanProblem, Robot, plan
+from calib_planner.acquisition import Standstill, StandstillDetector
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
-from calib_planner.files.campaign_store import CampaignStore, StoredModel, open_store
-from calib_planner.instrument.standstill import Standstill, StandstillDetector
-from calib_planner.ros import saving
-from calib_planner.ros.campaign import Campaign, Matching, TooFew
-from calib_planner.simulation import SimulatedCell, random_deviations
-from calib_planner.simulation.motion import make_tour
+from calib_planner.io import CampaignStore, StoredModel, open_store
+from calib_planner.ros import session as saving
+from calib_planner.ros.session import Campaign, Matching, TooFew
+from calib_planner.simulation import SimulatedCell, make_tour, random_deviations
 
 LIMITS = np.array([[-3.0, 3.0], [-3.0, 3.0]])
 HOW = Matching()

@@ -17,12 +17,13 @@ from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.catalogue import config_folder
-from calib_planner.ros import parameter_yaml
-from calib_planner.ros.campaign_node import CampaignNode
-from calib_planner.ros.identifier_node import IdentifierNode
+from calib_planner.io import config_folder
+from calib_planner.ros import settings as parameter_yaml
+from calib_planner.ros.nodes.campaign import CampaignNode
+from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.planner import PlannerNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import descriptor
-from calib_planner.ros.planner_node import PlannerNode
 from calib_planner.ros.settings import (
     CampaignParameters,
     IdentifierParameters,
@@ -30,7 +31,6 @@ from calib_planner.ros.settings import (
     SimulatorParameters,
     load_shipped,
 )
-from calib_planner.ros.simulator_node import SimulatorNode
 
 NODES = [
     ("planner", PlannerParameters, PlannerNode),
@@ -43,7 +43,7 @@ NODES = [
 @pytest.mark.parametrize("name", parameter_yaml.NODES)
 def test_the_yaml_is_what_the_dataclass_says(name: str) -> None:
     text = (config_folder() / f"{name}.yaml").read_text()
-    assert text == parameter_yaml.yaml_text(name), "run: python -m calib_planner.ros.parameter_yaml"
+    assert text == parameter_yaml.yaml_text(name), "run: python -m calib_planner.ros.settings"
 
 
 @pytest.mark.parametrize(("name", "kind", "_node"), NODES)
@@ -170,7 +170,7 @@ def test_what_cannot_be_configured_is_said(bench: Bench, values: dict[str, Any])
 def test_a_file_with_an_unknown_name_ends_the_process(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("/**:\n  ros__parameters:\n    sigm: 0.001\n")
-    command = [sys.executable, "-m", "calib_planner.ros.planner_node", "--ros-args", "--params-file", str(path)]
+    command = [sys.executable, "-m", "calib_planner.ros.nodes.planner", "--ros-args", "--params-file", str(path)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
     assert ended.returncode == 1 and "did you mean 'sigma'" in ended.stderr
     assert "Traceback" not in ended.stderr

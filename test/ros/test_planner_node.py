@@ -25,8 +25,8 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from calib_planner.errors import InputError
-from calib_planner.ros.model_source import Model
-from calib_planner.ros.planner_node import PlannerNode
+from calib_planner.ros.model import Model
+from calib_planner.ros.nodes.planner import PlannerNode
 from calib_planner.ros.qos import EVENTS, LATCHED
 
 SERVICE, ACTION = "calibration_planner/request_plan", "calibration_planner/plan"
@@ -89,7 +89,7 @@ def test_an_unforeseen_fault_is_answered(bench: Bench, monkeypatch: pytest.Monke
 
     bench.start(PlannerNode, robot="planar_2r", starts=4)
     with monkeypatch.context() as patch:
-        patch.setattr("calib_planner.ros.planner_node.answer", broken)
+        patch.setattr("calib_planner.ros.nodes.planner.answer", broken)
         answer = bench.call(PlanCalibration, SERVICE, request())
     assert answer.status == Response.INTERNAL_ERROR and "made for this test" in answer.message
     assert bench.call(PlanCalibration, SERVICE, request()).status == Response.SUCCESS

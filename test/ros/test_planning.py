@@ -15,7 +15,7 @@ from robots import random_configurations
 
 from calib_planner import PlanProblem, Robot, plan
 from calib_planner.errors import InputError
-from calib_planner.ros.model_source import NotReady, described_model, shipped_model
+from calib_planner.ros.model import NotReady, described_model, shipped_model
 from calib_planner.ros.planning import answer
 from calib_planner.ros.settings import PlannerParameters
 

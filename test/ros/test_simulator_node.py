@@ -17,12 +17,12 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from calib_planner import Plan, PlanProblem, Robot, plan
-from calib_planner.instrument.standstill import NANO
-from calib_planner.ros import simulator_node
-from calib_planner.ros.conversions import nanoseconds, plan_to_message
+from calib_planner.acquisition import NANO
+from calib_planner.ros.messages import nanoseconds, plan_to_message
+from calib_planner.ros.nodes import simulator as simulator_node
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.qos import SENSOR_IN
-from calib_planner.ros.simulator_node import SimulatorNode
-from calib_planner.simulation.motion import Tour, make_tour
+from calib_planner.simulation import Tour, make_tour
 
 ACTION = "tracker_simulator/execute_plan"
 Result = ExecutePlan.Result

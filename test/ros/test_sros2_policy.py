@@ -11,11 +11,11 @@ from policy import Profile, read_policy
 from rclpy.action import get_action_client_names_and_types_by_node, get_action_server_names_and_types_by_node
 from rclpy.node import Node
 
-from calib_planner.robot.catalogue import config_folder
-from calib_planner.ros.campaign_node import CampaignNode
-from calib_planner.ros.identifier_node import IdentifierNode
-from calib_planner.ros.planner_node import PlannerNode
-from calib_planner.ros.simulator_node import SimulatorNode
+from calib_planner.io import config_folder
+from calib_planner.ros.nodes.campaign import CampaignNode
+from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.planner import PlannerNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 
 FILE = config_folder() / "sros2" / "calib_planner.policy.xml"
 ABSOLUTE = {"/clock", "/diagnostics", "/parameter_events", "/rosout"}

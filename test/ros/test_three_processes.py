@@ -16,8 +16,8 @@ from calib_planner_msgs.srv import PlanCalibration
 
 from calib_planner import Robot
 from calib_planner.ros import demo
-from calib_planner.ros.conversions import estimate_from_message
-from calib_planner.ros.demo_client import DemoClient
+from calib_planner.ros.demo import DemoClient
+from calib_planner.ros.messages import estimate_from_message
 from calib_planner.ros.processes import Nodes, ProcessFailed, own_domain
 from calib_planner.simulation import random_deviations
 

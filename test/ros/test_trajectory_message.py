@@ -16,8 +16,8 @@ from robots import mixed, plan_of, random_configurations
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_planner import Robot
-from calib_planner.design.plan_sheet import plan_sheet
-from calib_planner.files.trajectory_yaml import trajectory_text
+from calib_planner.io.sheet import trajectory_text
+from calib_planner.planning import plan_sheet
 
 pytestmark = pytest.mark.ros
 

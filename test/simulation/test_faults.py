@@ -13,19 +13,20 @@ from scipy.stats import binom, chi2
 
 from calib_planner import Robot
 from calib_planner.errors import InputError
-from calib_planner.instrument.noise import LaserTracker
 from calib_planner.simulation import (
+    NANO,
     Faults,
     Itinerary,
     Message,
     Rates,
     SimulatedCell,
     Streams,
+    Tour,
     World,
     make_tour,
     play,
 )
-from calib_planner.simulation.motion import NANO, Tour
+from calib_planner.tracker import LaserTracker
 
 ROBOT = Robot.load("kuka_kr270").with_targets([[0.1, 0.02, 0.3], [-0.05, 0.2, 0.1]])
 CELL = SimulatedCell(ROBOT, {"d1": 1e-3, "q2": -5e-4}, sigma=0.0)

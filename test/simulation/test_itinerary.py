@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_planner.simulation.motion import NANO, Itinerary, make_tour
+from calib_planner.simulation import NANO, Itinerary, make_tour
 
 LIMITS = np.array([[-3.0, 3.0], [-3.0, 3.0]])
 Q = np.array([[1.0, -2.0], [-2.0, 2.0]])

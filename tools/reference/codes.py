@@ -15,11 +15,11 @@ from markdown import MADE, code, escaped, joined, table
 
 from calib_planner import errors
 from calib_planner.cli.main import CLOSED_PIPE, DONE, FAILED, INTERRUPTED, WRONG_USAGE
-from calib_planner.design.plan import STATUS as PLAN
-from calib_planner.design.prove import PROOF_STATUS
+from calib_planner.compensation import STATUS as COMPENSATION
 from calib_planner.identification import verdict
 from calib_planner.identification.estimate import STATUS as ESTIMATE
-from calib_planner.robot.compensation import STATUS as COMPENSATION
+from calib_planner.planning.certify.prove import PROOF_STATUS
+from calib_planner.planning.plan import STATUS as PLAN
 
 INTRODUCTION = """\
 Programs should look at these words; the messages beside them are for people. Those of ROS 2 interfaces are

@@ -53,10 +53,10 @@ def nodes() -> dict[str, list[tuple[str, ...]]]:
     """Node name → rows (name, kind, type, quality of service) of all that it offers and takes."""
     from rclpy.context import Context
 
-    from calib_planner.ros.campaign_node import CampaignNode
-    from calib_planner.ros.identifier_node import IdentifierNode
-    from calib_planner.ros.planner_node import PlannerNode
-    from calib_planner.ros.simulator_node import SimulatorNode
+    from calib_planner.ros.nodes.campaign import CampaignNode
+    from calib_planner.ros.nodes.identifier import IdentifierNode
+    from calib_planner.ros.nodes.planner import PlannerNode
+    from calib_planner.ros.nodes.simulator import SimulatorNode
 
     context = Context()
     context.init(args=["--ros-args", "-r", f"__ns:={NAMESPACE}"], domain_id=DOMAIN)

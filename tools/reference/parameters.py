@@ -25,7 +25,7 @@ transition of that name."""
 
 def page() -> str:
     """The page."""
-    from calib_planner.ros.parameter_yaml import NODES
+    from calib_planner.ros.settings import NODES
 
     lines = ["# Node parameters", "", MADE, "", INTRODUCTION]
     for name, (kind, node) in NODES.items():

@@ -1,0 +1,14 @@
+"""From streams of joint states and tracker points to standstills: stamps, clocks and intake."""
+
+from calib_planner.acquisition.clocks import Offset
+from calib_planner.acquisition.intake import MOST_NAMES, pick_joints
+from calib_planner.acquisition.standstill import (
+    IN_A_ROW,
+    NANO,
+    Reason,
+    Rejection,
+    Standstill,
+    StandstillDetector,
+    StandstillSettings,
+    mean_std,
+)

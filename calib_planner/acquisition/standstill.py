@@ -1,0 +1,464 @@
+"""When does the robot stand still, and what are the mean joints and points then?
+
+Still means: over an interval, max − min of every joint and of every coordinate of every point stays within a
+tolerance, and no gap between messages is longer than allowed. Velocities play no part (they are
+missing, noisy or zero at turning points), nor do arrival times: all that counts is the stamps, integer
+nanoseconds.
+
+The average begins ``settle`` after the joints came to rest, and as long after the points did: the end of a motion
+is within the tolerance, and were the tracker's clock ahead, the joints' rest alone would not leave it out. A
+result comes once per standstill: as soon as there are enough samples; after ``patience`` with what there is; or
+when the robot moves on. A standstill that ends without a result gives a rejection that says why.
+
+The tolerance on points has to be several times the tracker's noise: with σ = 0.03 mm the range of a thousand
+samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do as well as live ones.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib_planner.acquisition.clocks import ClockOffsets
+from calib_planner.acquisition.stamps import StampOrder
+from calib_planner.arrays import FloatArray, IntArray, check_array, check_count, check_number, frozen
+from calib_planner.errors import InputError
+from calib_planner.units import length, milliseconds
+
+NANO = 1_000_000_000
+IN_A_ROW = 50
+"""Unusable messages in a row that are worth a rejection of their own."""
+
+
+@dataclass(frozen=True)
+class StandstillSettings:
+    """What counts as standing still.
+
+    Attributes:
+        joint_tolerance: Largest range of a joint [rad | m].
+        point_tolerance: Largest range of a coordinate of a point [m].
+        settle: Left out after the joints came to rest [s].
+        duration: Shortest interval averaged [s].
+        samples: Points of every target wanted.
+        minimum_samples: Points of a target needed to use it at all.
+        patience: After this long at rest (beyond ``settle``) take what there is [s].
+        gap: Longest pause between messages of a stream [s].
+        window: How late a message may come after a later one of its stream [s].
+        skew: How far the streams' stamps may be apart [s].
+    """
+
+    joint_tolerance: float = 1e-4
+    point_tolerance: float = 3e-4
+    settle: float = 0.1
+    duration: float = 0.4
+    samples: int = 20
+    minimum_samples: int = 5
+    patience: float = 2.0
+    gap: float = 0.25
+    window: float = 0.1
+    skew: float = 0.5
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if f.name in ("samples", "minimum_samples"):
+                check_count(f.name, getattr(self, f.name), high=MOST_SAMPLES)
+                continue
+            closed = f.name in ("settle", "window")
+            check_number(f.name, getattr(self, f.name), low=0.0, high=3600.0, low_open=not closed)
+        if self.minimum_samples > self.samples:
+            raise InputError("minimum_samples", self.minimum_samples, f"at most samples = {self.samples}")
+
+
+class Reason(Enum):
+    """Why a standstill gave no measurement."""
+
+    MOVED = "moved"
+    TOO_FEW_SAMPLES = "too_few_samples"
+    TIME_SKEW = "time_skew"
+    OTHER_FRAME = "other_frame"
+    NOT_FINITE = "not_finite"
+
+
+@dataclass(frozen=True, eq=False)
+class Standstill:
+    """Means over an interval in which nothing moved. n joints, T targets.
+
+    Attributes:
+        start, stop: Stamps of the interval [ns].
+        joints: (n,) mean positions [rad | m].
+        points: (T, 3) mean points in the tracker's frame [m]; NaN where a target was not seen.
+        std: (T,) standard deviation of one coordinate of the mean point, from the scatter of the samples
+            pooled over x, y and z [m]; NaN where not seen.
+        samples: (T,) points averaged.
+    """
+
+    start: int
+    stop: int
+    joints: FloatArray
+    points: FloatArray
+    std: FloatArray
+    samples: IntArray
+
+    @property
+    def duration(self) -> float:
+        """Length of the interval [s]."""
+        return (self.stop - self.start) / NANO
+
+    @property
+    def stamp(self) -> int:
+        """Middle of the interval [ns]."""
+        return (self.start + self.stop) // 2
+
+
+@dataclass(frozen=True, eq=False)
+class Rejection:
+    """A standstill that cannot be used.
+
+    Attributes:
+        start, stop: Stamps of the interval [ns].
+        reason: Which of the known ones.
+        message: In words, with numbers and what to do.
+        joints: (n,) last positions [rad | m], NaN if there were none.
+        samples: (T,) points seen.
+    """
+
+    start: int
+    stop: int
+    reason: Reason
+    message: str
+    joints: FloatArray
+    samples: IntArray
+
+
+class StandstillDetector:
+    """Fed with stamped messages in any order; returns what they complete.
+
+    Args:
+        joints: Number of joints.
+        targets: Number of targets.
+        settings: What counts as standing still.
+    """
+
+    def __init__(self, joints: int, targets: int = 1, settings: StandstillSettings | None = None) -> None:
+        self.settings = s = settings or StandstillSettings()
+        self.joint_count = check_count("joints", joints, high=1000)
+        self.target_count = check_count("targets", targets, high=1000)
+        self._order: StampOrder[FloatArray] = StampOrder(1 + targets, _ns(s.window), _ns(s.skew))
+        horizon, gap = _ns(s.settle + max(s.patience, s.duration) + s.gap), _ns(s.gap)
+        self._joints = RestWindow(s.joint_tolerance, gap, horizon)
+        self._targets = [RestWindow(s.point_tolerance, gap, horizon) for _ in range(targets)]
+        self.clocks = ClockOffsets(targets, _ns(s.skew), _ns(s.duration) // 2)
+        self._measured: FloatArray | None = None
+        self._rest = (0, 0)  # stamps of the rest in which something was measured, so far
+        self._complained = False
+        self._saw_nan = False
+        self._nan_in_a_row = [0] * (1 + targets)
+        self._complained_at = [-(2**63)] * (1 + targets)  # about a stream, stamps [ns]
+
+    def add_joints(self, stamp: int, positions: ArrayLike) -> list[Standstill | Rejection]:
+        """Take joint positions (joints,) [rad | m] with their stamp [ns]; NaN = unusable."""
+        meaning = "joint positions in rad or m"
+        shape = (self.joint_count,)
+        return self._add(0, stamp, check_array("positions", positions, shape, finite=False, meaning=meaning))
+
+    def add_point(self, target: int, stamp: int, xyz: ArrayLike) -> list[Standstill | Rejection]:
+        """Take a point (3,) [m] of target number ``target``, from 0; NaN = not seen."""
+        if not 0 <= target < self.target_count:
+            raise InputError("target", target, f"0 to {self.target_count - 1}")
+        return self._add(1 + target, stamp, check_array("xyz", xyz, (3,), finite=False))
+
+    def flush(self) -> list[Standstill | Rejection]:
+        """Take what still waits, and the last standstill as ended: the end of a recording."""
+        results = self._process(everything=True) + self._ended()
+        self.clocks.clear()
+        self._joints.samples.clear()
+        self._measured = None
+        return results
+
+    def offset_text(self, bound: float) -> str:
+        """In words, which target's stamps are more than ``bound`` [s] from the joints'; empty if none are."""
+        for k in range(self.target_count):
+            offset = self.clocks.offset(k)
+            if offset is not None and offset.exceeds(bound):
+                text = f"target {k + 1} is stamped {milliseconds(offset.seconds, plus=True)} from the joints"
+                by = f"by when both stopped and started at {offset.standstills} standstills"
+                return f"{text}, {by}, {milliseconds(bound)} are allowed: synchronise the clocks"
+        return ""
+
+    def misdated(self, bound: float) -> list[tuple[int, int]]:
+        """Rests of the joints [ns] with a target's stamps more than ``bound`` [s] off, see ``ClockOffsets``."""
+        return [rest for k in range(self.target_count) for rest in self.clocks.beyond(k, bound)]
+
+    @property
+    def dropped(self) -> tuple[int, ...]:
+        """Finite messages that took no part, joints first, then each target: too late, twice or set back."""
+        return tuple(self._order.dropped(k) for k in range(1 + self.target_count))
+
+    # ── from messages to events in order ─────────────────────────────────────────────────────────────
+
+    def _add(self, stream: int, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
+        stamp = int(stamp)
+        if not np.isfinite(value).all():
+            self._saw_nan = True
+            self._nan_in_a_row[stream] += 1
+            text = f"{self._nan_in_a_row[stream]} messages in a row from {_name(stream)} are not finite"
+            text += ": check line of sight and driver"
+            bad = self._nan_in_a_row[stream] >= IN_A_ROW
+            return self._complaint(stream, stamp, Reason.NOT_FINITE, text) if bad else []
+        self._nan_in_a_row[stream] = 0
+        if not self._order.add(stream, stamp, value) and self._lags(stream):
+            return self._complaint(stream, stamp, Reason.TIME_SKEW, self._lag_text(stream))
+        return self._process()
+
+    def _complaint(self, stream: int, stamp: int, reason: Reason, text: str) -> list[Standstill | Rejection]:
+        """A rejection about a stream, as often as there could have been a standstill."""
+        before = self._complained_at[stream]
+        if before <= stamp <= before + _ns(self.settings.patience):
+            return []
+        self._complained_at[stream] = stamp
+        return [self._rejection(stamp, stamp, reason, text)]
+
+    def _lags(self, stream: int) -> bool:
+        """Whether a stream lies so far behind the others that it takes no part."""
+        return self._order.late(stream) >= IN_A_ROW
+
+    def _lag_text(self, stream: int) -> str:
+        text = f"stamps from {_name(stream)} lie {self._order.lag(stream) / NANO:.3g} s behind the others"
+        return f"{text}: synchronise the clocks, or raise skew if its messages take that long"
+
+    def _process(self, *, everything: bool = False) -> list[Standstill | Rejection]:
+        results: list[Standstill | Rejection] = []
+        for stamp, stream, value in self._order.ready(everything=everything):
+            if stream:
+                self._on_point(stream - 1, stamp, value)
+            else:
+                results += self._on_joints(stamp, value)
+            results += self._complete(stamp)
+        return results
+
+    def _on_joints(self, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
+        joints, results = self._joints, []
+        if self._measured is not None:
+            if np.max(np.abs(value - self._measured)) <= joints.tolerance:
+                self._rest = (self._rest[0], stamp)
+                return []
+            self.clocks.add_joints(*self._rest)
+            self._measured = None
+            joints.samples.clear()
+        elif joints.samples and not (joints.on_time(stamp) and joints.spread_with(value) <= joints.tolerance):
+            self.clocks.add_joints(joints.since, joints.last)
+            results = self._ended()
+            joints.samples.clear()
+        if not joints.samples:
+            self._complained = self._saw_nan = False
+            for window in self._targets:
+                window.moved_by = 0.0
+        joints.push(stamp, value)
+        return results
+
+    def _on_point(self, target: int, stamp: int, value: FloatArray) -> None:
+        window = self._targets[target]
+        at_rest = self._joints.samples and stamp >= self._joints.since + _ns(self.settings.settle)
+        if at_rest and self._measured is None and window.on_time(stamp):
+            spread = window.spread_with(value)
+            if spread > window.tolerance:
+                window.moved_by = max(window.moved_by, spread)
+        if (rest := window.push(stamp, value)) is not None:
+            self.clocks.add_point(target, *rest)
+
+    # ── the decision ─────────────────────────────────────────────────────────────────────────────────
+
+    def _complete(self, stamp: int) -> list[Standstill | Rejection]:
+        """The result, if there is enough by ``stamp``, or if patience has run out."""
+        s, joints = self.settings, self._joints
+        begin = joints.since + _ns(s.settle)
+        if self._measured is not None or not joints.samples or stamp - begin < _ns(s.duration):
+            return []
+        stop = min(stamp, joints.last)
+        if all(len(w.samples) >= s.samples and stop - w.last <= w.gap for w in self._targets):
+            start = max(begin, *(w.settled(_ns(s.settle)) for w in self._targets))
+            if stop - start >= _ns(s.duration):
+                found = self._average(start, stop, s.samples)
+                if found is not None and (found.samples >= s.samples).all():
+                    return self._take(found)
+        if stop - begin < _ns(s.patience) or self._complained:
+            return []
+        return self._what_there_is(begin, stop)
+
+    def _ended(self) -> list[Standstill | Rejection]:
+        """The joints moved on: what the standstill gives, if it was worth the name."""
+        begin, stop = self._joints.since + _ns(self.settings.settle), self._joints.last
+        brief = stop - begin < _ns(self.settings.duration) // 2
+        if self._measured is not None or not self._joints.samples or brief or self._complained:
+            return []
+        return self._what_there_is(begin, stop)
+
+    def _what_there_is(self, begin: int, stop: int) -> list[Standstill | Rejection]:
+        least, settle = self.settings.minimum_samples, _ns(self.settings.settle)
+        starts = [max(begin, w.settled(settle)) for w in self._targets if len(w.samples) >= least]
+        found = self._average(max(starts), stop, least) if starts else None
+        if found is not None and 2 * (found.stop - found.start) >= _ns(self.settings.duration):
+            return self._take(found)
+        self._complained = True
+        return [self._rejection(begin, stop, *self._why(begin, stop))]
+
+    def _take(self, found: Standstill) -> list[Standstill | Rejection]:
+        self._measured = found.joints
+        self._rest = (self._joints.since, self._joints.last)
+        self._joints.samples.clear()
+        return [found]
+
+    def _average(self, start: int, stop: int, least: int) -> Standstill | None:
+        """Means over [start, stop] of the targets with at least ``least`` samples; None if there are none."""
+        q = self._joints.between(start, stop)
+        points = np.full((self.target_count, 3), np.nan)
+        std = np.full(self.target_count, np.nan)
+        samples = np.zeros(self.target_count, np.int64)
+        for k, window in enumerate(self._targets):
+            rows = window.between(start, stop)
+            if len(rows) < least:
+                continue
+            points[k], samples[k] = rows.mean(axis=0), len(rows)
+            if len(rows) > 1:
+                std[k] = np.sqrt(rows.var(axis=0, ddof=1).mean() / len(rows))
+        if not len(q) or not samples.any():
+            return None
+        return Standstill(start, stop, *map(frozen, (q.mean(axis=0), points, std, samples)))
+
+    def _why(self, begin: int, stop: int) -> tuple[Reason, str]:
+        moved = [w.moved_by for w in self._targets]
+        if max(moved) > 0:
+            k = int(np.argmax(moved))
+            text = f"target {k + 1} moved by {length(moved[k])} while the joints stood still"
+            return Reason.MOVED, f"{text}: wait until nothing vibrates, or raise point_tolerance"
+        if self._saw_nan:
+            return Reason.NOT_FINITE, "values are not finite: check line of sight and the drivers"
+        if stop - begin < _ns(self.settings.duration):
+            return (
+                Reason.MOVED,
+                f"the robot moved on {(stop - begin) / NANO:.2f} s after settling: dwell longer",
+            )
+        behind = next((k for k in range(1, 1 + self.target_count) if self._lags(k)), None)
+        if behind is not None:
+            return Reason.TIME_SKEW, self._lag_text(behind)
+        s, most = self.settings, max(len(w.between(begin, stop)) for w in self._targets)
+        text = f"{most} points in {(stop - begin) / NANO:.2f} s without a pause over {s.gap:g} s"
+        text += f", at least {s.minimum_samples} needed"
+        return Reason.TOO_FEW_SAMPLES, f"{text}: check the tracker, its topic and its rate, or dwell longer"
+
+    def _rejection(self, start: int, stop: int, reason: Reason, message: str) -> Rejection:
+        last = self._joints.samples[-1][1] if self._joints.samples else np.full(self.joint_count, np.nan)
+        samples = np.array([len(w.between(start, stop)) if w.samples else 0 for w in self._targets])
+        return Rejection(start, stop, reason, message, frozen(last), frozen(samples))
+
+
+def _name(stream: int) -> str:
+    return f"target {stream}" if stream else "the joints"
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * NANO)
+
+
+# ── The samples of one stream since it came to rest; one that breaks the rest begins a new one ──────────────
+
+MOST_SAMPLES = 20_000
+"""Samples of one stream kept at most."""
+
+
+@dataclass
+class RestWindow:
+    """See the module.
+
+    Attributes:
+        tolerance: Largest range of a coordinate [rad | m].
+        gap: Longest pause between samples [ns].
+        horizon: Samples older than this are forgotten [ns].
+        since, last: Stamps of the first and the last sample of the rest [ns].
+        arrived: Whether a motion came before the rest, as far as seen: not a gap.
+        moved_by: Kept for who asks why there was no standstill [m].
+        samples: ``(stamp, value)``, the oldest first.
+    """
+
+    tolerance: float
+    gap: int
+    horizon: int
+    since: int = 0
+    last: int = 0
+    arrived: bool = False
+    moved_by: float = 0.0
+    samples: deque[tuple[int, FloatArray]] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
+    _low: FloatArray = field(default_factory=lambda: np.empty(0))
+    _high: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def on_time(self, stamp: int) -> bool:
+        """Whether ``stamp`` follows the last sample without a gap."""
+        return bool(self.samples) and 0 < stamp - self.last <= self.gap
+
+    def settled(self, settle: int) -> int:
+        """Stamp from which on it is at rest, ``settle`` [ns] after a motion."""
+        return self.since + settle * self.arrived
+
+    def spread_with(self, value: FloatArray) -> float:
+        """Range, largest over the coordinates, were ``value`` to join."""
+        return float(np.max(np.maximum(self._high, value) - np.minimum(self._low, value)))
+
+    def push(self, stamp: int, value: FloatArray) -> tuple[int, int] | None:
+        """Take a sample; one that breaks the rest begins a new one, and gives the old one's interval [ns]."""
+        ended = None
+        if self.on_time(stamp) and self.spread_with(value) <= self.tolerance:
+            self._low, self._high = np.minimum(self._low, value), np.maximum(self._high, value)
+        else:
+            self.arrived = self.on_time(stamp)
+            ended = (self.since, self.last) if self.samples else None
+            self.samples.clear()
+            self._low = self._high = value
+            self.since = stamp
+        self.last = stamp
+        self.samples.append((stamp, value))
+        while self.samples[0][0] < stamp - self.horizon:
+            self.samples.popleft()
+        return ended
+
+    def between(self, start: int, stop: int) -> FloatArray:
+        """(samples, n) values with stamps in [start, stop]."""
+        rows = [v for t, v in self.samples if start <= t <= stop]
+        return np.array(rows).reshape(len(rows), len(self._low))
+
+
+# ── How uncertain the mean points of standstills are ────────────────────────────────────────────────────────
+# A mean of n samples has σ/√n, with one σ for all standstills: given, or pooled over their scatter, since that of
+# a single standstill of twenty samples is known to 10 % only. What averaging does not reduce (the robot's
+# repeatability, how the reflector sits) is added in squares.
+
+
+def mean_std(found: Sequence[Standstill], sigma: float = 0.0, repeatability: float = 0.0) -> FloatArray | None:
+    """(N, T, 3) standard deviation of each coordinate of the mean points [m], NaN where a target was not seen.
+
+    Args:
+        found: N standstills of T targets, at least one.
+        sigma: Standard deviation of one coordinate of one sample [m]; 0: from the samples' scatter.
+        repeatability: Standard deviation that averaging does not reduce [m].
+
+    Returns:
+        ``None`` where it is not known: no scatter, or a single sample each.
+    """
+    samples = np.array([f.samples for f in found])
+    sigma = sigma or scatter(found)
+    with np.errstate(divide="ignore"):
+        std = np.sqrt(sigma**2 / samples + repeatability**2)
+    std = np.repeat(np.where(samples > 0, std, np.nan)[:, :, None], 3, axis=2)
+    return std if bool((std[samples > 0] > 0).all()) else None
+
+
+def scatter(found: Sequence[Standstill]) -> float:
+    """Standard deviation of one coordinate of one sample [m], pooled; NaN free, 0 if unknown."""
+    freedom = np.array([np.maximum(f.samples - 1, 0) for f in found])
+    variance = np.array([f.std**2 * f.samples for f in found])
+    total = float(freedom.sum())
+    return float(np.sqrt(np.nansum(freedom * variance) / total)) if total else 0.0

@@ -1,0 +1,167 @@
+"""The only gatekeepers for arrays: each ``check_*`` returns the canonical, read-only float64 copy.
+
+Inner code assumes that what passed here is clean: right shape, finite, C-ordered, immutable.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_planner.errors import InputError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a C-ordered copy that cannot be written to."""
+    copy = np.array(array, order="C", copy=True)
+    copy.setflags(write=False)
+    return copy
+
+
+def check_array(
+    field: str,
+    value: ArrayLike,
+    shape: Sequence[int | None],
+    *,
+    finite: bool = True,
+    meaning: str = "",
+) -> FloatArray:
+    """Return ``value`` as a read-only float64 array of the wanted shape.
+
+    Args:
+        field: Name used in the error.
+        value: Anything NumPy reads as numbers.
+        shape: Wanted shape; ``None`` matches any length on that axis.
+        finite: Refuse NaN and infinities.
+        meaning: Words for the axes, e.g. ``"(configurations, joints) in rad"``.
+
+    Raises:
+        InputError: Naming ``field``, what came in and what is valid.
+    """
+    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+    expected = f"an array of shape {wanted}" + (f", {meaning}" if meaning else "")
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(field, f"{type(value).__name__} ({error})", expected) from None
+    fits = array.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise InputError(field, f"shape {array.shape}", expected)
+    if finite and not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(
+            field,
+            f"{array[where]} at index {where}",
+            "finite numbers only",
+            "remove or repair that entry",
+        )
+    return frozen(array)
+
+
+def check_configurations(field: str, value: ArrayLike, joint_names: Sequence[str]) -> FloatArray:
+    """Return joint configurations as ``(N, joints)``; one configuration may come as ``(joints,)``."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.asarray(value, dtype=object)
+    if array.ndim == 1 and array.size:
+        array = array[None, :]
+    meaning = f"(configurations, joints) in rad or m, joints in the order {', '.join(joint_names)}"
+    return check_array(field, array, (None, len(joint_names)), meaning=meaning)
+
+
+def check_number(
+    field: str,
+    value: object,
+    *,
+    low: float = -np.inf,
+    high: float = np.inf,
+    low_open: bool = False,
+    unit: str = "",
+) -> float:
+    """Return ``value`` as a finite float within ``[low, high]`` (``(low, high]`` if ``low_open``)."""
+    left = "(" if low_open else "["
+    expected = f"a finite number in {left}{low:g}, {high:g}]" + (f" {unit}" if unit else "")
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputError(field, repr(value), expected) from None
+    below = number <= low if low_open else number < low
+    if not np.isfinite(number) or below or number > high:
+        raise InputError(field, repr(value), expected)
+    return number
+
+
+def check_count(field: str, value: object, *, low: int = 1, high: int = 10_000_000) -> int:
+    """Return ``value`` as an int within ``[low, high]``."""
+    expected = f"a whole number from {low} to {high}"
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise InputError(field, repr(value), expected)
+    if not low <= int(value) <= high:
+        raise InputError(field, repr(value), expected)
+    return int(value)
+
+
+# ── One thread of linear algebra while we compute: our matrices are small ───────────────────────────────────
+# BLAS libraries hand matrices of a few hundred rows to all cores, where the threads spin until the slowest is
+# done. On a machine that has anything else to do an identification takes tens of times as long that way, on an
+# idle one it gains nothing. threadpoolctl tells the libraries, and puts back what was set when the last of ours
+# has ended; without it (extra ``threads``; no package of ROS) set ``OMP_NUM_THREADS=1``.
+
+try:
+    from threadpoolctl import ThreadpoolController
+except ImportError:  # pragma: no cover
+    ThreadpoolController = None
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _OneThread:
+    """A context manager that any number of threads may be in at once."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+        self._controller: Any = None
+        self._limit: Any = None
+
+    def __enter__(self) -> None:
+        if ThreadpoolController is None:
+            return
+        with self._lock:
+            if not self._inside:
+                # Looked for once: numpy's and scipy's libraries are there when this is first called.
+                self._controller = self._controller or ThreadpoolController()
+                self._limit = self._controller.limit(limits=1, user_api="blas")
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        if ThreadpoolController is None:
+            return
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                self._limit.restore_original_limits()
+
+
+ONE_THREAD = _OneThread()
+
+
+def one_thread(function: F) -> F:
+    """Decorator: linear algebra in ``function`` is done by the thread that calls it."""
+
+    @functools.wraps(function)
+    def within(*args: Any, **kwargs: Any) -> Any:
+        with ONE_THREAD:
+            return function(*args, **kwargs)
+
+    return within  # type: ignore[return-value]

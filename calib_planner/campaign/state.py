@@ -1,0 +1,366 @@
+"""A campaign as a value: what was planned, what was measured, what failed; events in, the next action out.
+
+Nothing here computes: ``next_action`` and the events take microseconds, so that whoever moves the robot always
+knows what to do. What takes seconds is a ``Decision``, made by ``decide`` from a state anywhere (a worker thread)
+and taken in by ``decided`` whenever it is ready; events that came meanwhile are kept.
+
+    Replan ──decide──▶ Measure … Measure ──▶ Replan ──▶ … ──▶ Validate ──▶ Measure … ──▶ Validate ──▶ Finished
+             (a batch)                                (outcome)          (validation)            (verdict)
+
+*Visits* wait in a queue in the order of travel. A measurement takes its visit out; a failed attempt leaves it
+there until the configuration's attempts are used up; a configuration given up leaves with all its visits and with
+those in its neighbourhood, and when the batch is through the rest is planned around it. A measurement that is
+withdrawn (found to be an outlier, undone) puts its visit back. Pausing changes nothing but the next action.
+
+The measurements are all that cannot be made again: ``from_measurements`` begins where they end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib_planner.arrays import FloatArray, check_array, frozen
+from calib_planner.campaign.problem import CampaignProblem, Exclusion, distances, joint_scale, radius_of
+from calib_planner.errors import InputError
+from calib_planner.identification import configuration_labels
+from calib_planner.measurements import Measurements
+
+if TYPE_CHECKING:
+    from calib_planner.campaign.problem import CampaignResult, Round
+
+FIT, VALIDATION, FINISHED = "fit", "validation", "finished"
+PHASES = (FIT, VALIDATION, FINISHED)
+LARGEST = 1e5
+"""Coordinates beyond this [m | rad] are no measurement, and their squares would spoil every fit to come."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """A configuration (joints,) [rad | m], for ``fit`` or ``validation``, to be measured ``times`` times."""
+
+    q: FloatArray
+    role: str
+    times: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "q", frozen(np.asarray(self.q, float)))
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A measurement.
+
+    Attributes:
+        number: Its own, for undo.
+        index: Number of its stop.
+        q: (joints,) where the robot stood [rad | m].
+        points: (targets, 3) [m]; NaN where a target was not seen.
+    """
+
+    number: int
+    index: int
+    q: FloatArray
+    points: FloatArray
+
+
+# ── what to do next ──────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Measure the targets at ``q`` (joints,), stop ``index``, for the ``repetition``-th time, from 0."""
+
+    index: int
+    q: FloatArray
+    role: str
+    repetition: int
+
+
+@dataclass(frozen=True)
+class Replan:
+    """Identify and plan the next batch: ``decide``."""
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Choose what to validate with, or compare and judge: ``decide``."""
+
+
+@dataclass(frozen=True)
+class Paused:
+    """Wait for ``resumed``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """There is a result."""
+
+    result: CampaignResult
+
+
+Action = Measure | Replan | Validate | Paused | Finished
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignState:
+    """Everything about a campaign; made by ``begin`` or ``from_measurements``.
+
+    Attributes:
+        problem: What is asked.
+        stops: All configurations planned so far; their place is their number.
+        queue: Numbers of the stops still to be visited, in order; a stop to be measured twice is there twice.
+        rows: The measurements, in the order of coming.
+        failures: ``(index, reason)`` of every attempt that gave no measurement.
+        exclusions: Stops given up, never measured.
+        dropped: Numbers of stops that were measured, and could not be again.
+        rounds: What was decided after each batch.
+        phase: One of ``PHASES``.
+        outcome: Why no more is measured for the fit, a key of ``result.OUTCOMES``; empty before.
+        message: The outcome or what goes on, in words.
+        left: Forecast of measurements still needed for the fit; infinite: it cannot be reached.
+        paused: Whether nothing is to be sent to the robot.
+        result: The end.
+    """
+
+    problem: CampaignProblem
+    stops: tuple[Stop, ...] = ()
+    queue: tuple[int, ...] = ()
+    rows: tuple[Row, ...] = ()
+    failures: tuple[tuple[int, str], ...] = ()
+    exclusions: tuple[Exclusion, ...] = ()
+    dropped: tuple[int, ...] = ()
+    rounds: tuple[Round, ...] = ()
+    phase: str = FIT
+    outcome: str = ""
+    message: str = ""
+    left: float = float("nan")
+    paused: bool = False
+    result: CampaignResult | None = None
+
+    # ── looking ──────────────────────────────────────────────────────────────────────────────────────
+
+    @property
+    def action(self) -> Action:
+        """What to do next."""
+        if self.result is not None:
+            return Finished(self.result)
+        if self.paused:
+            return Paused()
+        if self.queue:
+            index = self.queue[0]
+            done = sum(r.index == index for r in self.rows)
+            return Measure(index, self.stops[index].q, self.stops[index].role, done)
+        return Replan() if self.phase == FIT else Validate()
+
+    def of_role(self, role: str) -> tuple[Row, ...]:
+        """Measurements for the fit, or for the validation."""
+        return tuple(r for r in self.rows if self.stops[r.index].role == role)
+
+    def data(self, role: str = FIT) -> Measurements | None:
+        """The same as the library's value, or ``None``."""
+        rows = self.of_role(role)
+        if not rows:
+            return None
+        q, points = np.array([r.q for r in rows]), np.array([r.points for r in rows])
+        return Measurements(self.problem.robot.joint_names, q, points)
+
+    def spent(self, role: str | None = None) -> int:
+        """Measurements made, those that failed included; skipped and unreachable configurations cost none."""
+        made = [r.index for r in self.rows] + [i for i, _ in self.failures]
+        return sum(role is None or self.stops[i].role == role for i in made)
+
+    @property
+    def given_up(self) -> int:
+        """Configurations that could not be measured, without those that a person asked to skip."""
+        return sum(not e.asked for e in self.exclusions) + len(self.dropped)
+
+    @property
+    def measured_q(self) -> FloatArray:
+        """(N, joints) where something was measured."""
+        q = [r.q for r in self.rows]
+        return np.array(q).reshape(len(q), len(self.problem.robot.joint_names))
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """See ``exclusion.joint_scale``."""
+        return joint_scale(self.problem.robot)
+
+    # ── events ───────────────────────────────────────────────────────────────────────────────────────
+
+    def measured(self, index: int, q: ArrayLike, points: ArrayLike, number: int | None = None) -> CampaignState:
+        """A measurement of a stop; one whose ``number`` is there already replaces it.
+
+        Args:
+            q: (joints,) where the robot stood [rad | m].
+            points: (targets, 3) [m], NaN where a target was not seen; (3,) will do for one target.
+
+        Raises:
+            InputError: No such stop, wrong shape, not a robot's numbers, no target seen at all.
+        """
+        self._check_index(index)
+        robot = self.problem.robot
+        joints = check_array("q", q, (len(robot.joint_names),), meaning="joints in rad or m")
+        array = np.asarray(points, float)
+        shaped = array.reshape(1, 3) if array.shape == (3,) else array
+        clean = check_array(
+            "points", shaped, (len(robot.targets), 3), finite=False, meaning="(targets, xyz) in m"
+        )
+        for name, values in (("q", joints), ("points", clean)):
+            if (np.abs(values) > LARGEST).any():
+                got = f"{np.nanmax(np.abs(values)):.3g}"
+                raise InputError(name, got, f"at most {LARGEST:g}, in m or rad", "look at who sends it")
+        if np.isnan(clean).all():
+            raise InputError("points", "NaN only", "at least one target that was seen", "report it as failed")
+        if number is None:
+            number = max((r.number for r in self.rows), default=-1) + 1
+        row = Row(number, index, joints, clean)
+        if any(r.number == number for r in self.rows):
+            return replace(self, rows=tuple(row if r.number == number else r for r in self.rows))
+        return replace(self, rows=(*self.rows, row), queue=_without_first(self.queue, index))
+
+    def withdrawn(self, number: int, reason: str) -> CampaignState:
+        """A measurement does not count any more (an outlier, undone): its stop is visited again, if it may be."""
+        gone = next((r for r in self.rows if r.number == number), None)
+        if gone is None:
+            return self
+        state = replace(self, rows=tuple(r for r in self.rows if r.number != number))
+        if self.stops[gone.index].role != self.phase or gone.index in self._gone:
+            return replace(state, failures=(*self.failures, (gone.index, reason)))
+        return replace(state, queue=(*self.queue, gone.index)).failed(gone.index, reason)
+
+    def failed(self, index: int, reason: str) -> CampaignState:
+        """The robot stood there and nothing usable came of it; given up when its attempts are used up."""
+        self._check_index(index)
+        state = replace(self, failures=(*self.failures, (index, reason)))
+        tries = sum(i == index for i, _ in state.failures)
+        return state._exclude(index, reason, asked=False) if tries >= self.problem.attempts else state
+
+    def unreachable(self, index: int, reason: str) -> CampaignState:
+        """The robot cannot get there."""
+        self._check_index(index)
+        return self._exclude(index, reason, asked=False)
+
+    def skipped(self, index: int, reason: str = "skipped on request") -> CampaignState:
+        """A person does not want the robot there."""
+        self._check_index(index)
+        return self._exclude(index, reason, asked=True)
+
+    def pause(self) -> CampaignState:
+        """Send the robot nowhere from now on."""
+        return replace(self, paused=True)
+
+    def resume(self) -> CampaignState:
+        """Go on."""
+        return replace(self, paused=False)
+
+    def decided(self, decision: Decision) -> CampaignState:
+        """Take in what ``decide`` found."""
+        stops = [replace(s, role=FIT) for s in self.stops] if decision.joins else list(self.stops)
+        for index, more in decision.again:
+            stops[index] = replace(stops[index], times=stops[index].times + more)
+        return replace(
+            self,
+            stops=(*stops, *decision.stops),
+            queue=(*self.queue, *(i for i in decision.queue if i not in self._gone)),
+            rounds=self.rounds if decision.round is None else (*self.rounds, decision.round),
+            phase=decision.phase,
+            outcome="" if decision.joins else decision.outcome or self.outcome,
+            message=decision.message,
+            left=decision.left,
+            result=decision.result,
+        )
+
+    def _exclude(self, index: int, reason: str, *, asked: bool) -> CampaignState:
+        state = replace(self, queue=tuple(i for i in self.queue if i != index))
+        if any(r.index == index for r in self.rows):
+            return replace(state, dropped=(*self.dropped, index))
+        q, scale = self.stops[index].q, self.scale
+        radius = radius_of(q, self.exclusions, self.measured_q, scale, self.problem.exclusion)
+        state = replace(state, exclusions=(*self.exclusions, Exclusion(index, q, radius, reason, asked)))
+        if state.given_up > self.problem.most_failures:
+            return replace(state, queue=())
+        near = [i for i in state.queue if distances(self.stops[i].q[None], q, scale)[0] < radius]
+        return replace(state, queue=tuple(i for i in state.queue if i not in near))
+
+    @property
+    def _gone(self) -> set[int]:
+        """Stops that are not visited any more."""
+        return {e.index for e in self.exclusions} | set(self.dropped)
+
+    def _check_index(self, index: int) -> None:
+        if not 0 <= index < len(self.stops):
+            raise InputError("index", index, f"a stop, 0 to {len(self.stops) - 1}")
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """What ``CampaignState.decided`` takes in.
+
+    Attributes:
+        phase: Of the campaign from now on.
+        message: What was decided, in words.
+        stops: New stops, numbered on from the state's.
+        again: ``(number, times)`` of stops to be measured more often.
+        queue: Visits, in order.
+        outcome: Why the fit ends, if it does.
+        round: What is known now.
+        joins: Whether the validation's measurements join the fit.
+        left: Forecast of measurements still needed for the fit.
+        result: The end.
+    """
+
+    phase: str
+    message: str
+    stops: tuple[Stop, ...] = ()
+    again: tuple[tuple[int, int], ...] = ()
+    queue: tuple[int, ...] = ()
+    outcome: str = ""
+    round: Round | None = None
+    joins: bool = False
+    left: float = 0.0
+    result: CampaignResult | None = None
+
+
+def begin(problem: CampaignProblem) -> CampaignState:
+    """Before the first plan."""
+    return CampaignState(problem)
+
+
+def from_measurements(
+    problem: CampaignProblem,
+    fit: Measurements | None,
+    validation: Measurements | None = None,
+    exclusions: tuple[Exclusion, ...] = (),
+) -> CampaignState:
+    """A campaign that goes on from measurements made before, such as those that a store kept over a crash.
+
+    What was planned and not measured is planned anew. Rows of one configuration are repetitions of one stop.
+
+    Raises:
+        InputError: Other joints or targets than the robot's.
+    """
+    state = CampaignState(problem)
+    for role, data in ((FIT, fit), (VALIDATION, validation)):
+        if data is None or not len(data):
+            continue
+        ordered = data.in_order_of(problem.robot.joint_names)
+        labels = configuration_labels(ordered.q)
+        first = len(state.stops)
+        stops = [Stop(ordered.q[labels == k][0], role, int((labels == k).sum())) for k in range(labels.max() + 1)]
+        state = replace(state, stops=(*state.stops, *stops))
+        for q, points, label in zip(ordered.q, ordered.p, labels, strict=True):
+            if not np.isnan(points).all():
+                state = state.measured(first + int(label), q, points)
+    return replace(state, exclusions=exclusions)
+
+
+def _without_first(queue: tuple[int, ...], index: int) -> tuple[int, ...]:
+    if index not in queue:
+        return queue
+    at = queue.index(index)
+    return queue[:at] + queue[at + 1 :]

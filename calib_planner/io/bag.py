@@ -1,0 +1,518 @@
+"""Measurements out of a rosbag2 recording: joint states and tracker points, paired where the robot stood still.
+
+The decisions are the live node's: every message goes, in the order of recording, through the same
+``StandstillDetector`` with the same settings; only the stamps in the headers count. The bag is read as a stream.
+Every standstill is a row of its own, also if the robot was there before. Nothing is left out in silence: what
+took no part is counted by topic and reason, and a bag whose end cannot be read is refused, unless the part before
+is explicitly accepted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_planner.acquisition import (
+    MOST_NAMES,
+    NANO,
+    Rejection,
+    Standstill,
+    StandstillDetector,
+    StandstillSettings,
+    mean_std,
+    pick_joints,
+)
+from calib_planner.arrays import FloatArray, IntArray, check_number, frozen
+from calib_planner.errors import FileFormatError, InputError, MissingExtraError, UnknownNameError
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class BagMeasurements:
+    """What a bag says.
+
+    Attributes:
+        data: One row per standstill, in the order of time; std from the scatter of the samples unless given.
+        standstills: The same with their intervals and numbers of samples.
+        rejections: Standstills that gave no row, with the reason.
+        streams: What became of the messages, joints first, then each target.
+        frame_id: Frame of the points; empty if no message told.
+        damage: Why the end of the bag is missing; empty if it is whole.
+    """
+
+    data: Measurements
+    standstills: tuple[Standstill, ...]
+    rejections: tuple[Rejection, ...]
+    streams: tuple[Stream, ...]
+    frame_id: str
+    damage: str
+
+    @property
+    def stamps(self) -> IntArray:
+        """(N,) middle of each row's interval [ns]."""
+        return frozen(np.array([s.stamp for s in self.standstills], np.int64))
+
+    def describe(self) -> list[str]:
+        """Lines for people: rows, rejections by reason with an example, messages by topic, damage."""
+        lines = [f"{len(self.standstills)} standstills in frame {self.frame_id or '(not named)'}"]
+        lines += _reasons(self.rejections) + [s.describe() for s in self.streams]
+        return lines + ([f"damaged: {self.damage}"] if self.damage else [])
+
+
+def read_bag(
+    path: str | Path,
+    robot: Robot,
+    topics: BagTopics | None = None,
+    settings: StandstillSettings | None = None,
+    *,
+    sigma: float = 0.0,
+    repeatability: float = 0.0,
+    accept_damaged: bool = False,
+    progress: Callable[[float, str], None] | None = None,
+) -> BagMeasurements:
+    """Read a bag; the joints come in the robot's order, targets in that of the topics.
+
+    Args:
+        path: The bag's folder, or its .db3 or .mcap file.
+        robot: Gives the names of the joints.
+        topics: Where joint states and points are.
+        settings: What counts as standing still.
+        sigma: Standard deviation of one coordinate of one sample [m]; 0: from the samples' scatter.
+        repeatability: Standard deviation that averaging does not reduce [m].
+        accept_damaged: Take what could be read of a damaged bag; it says so in ``damage``.
+        progress: Called with the share done and a text now and then.
+
+    Raises:
+        MissingExtraError: rosbags is not installed.
+        FileFormatError: Not a bag; a topic missing, of another type or without usable messages; damaged;
+            points in several frames; clocks that do not overlap; no standstill.
+    """
+    topics, settings = topics or BagTopics(), settings or StandstillSettings()
+    check_number("sigma", sigma, low=0, high=1, unit="m")
+    check_number("repeatability", repeatability, low=0, high=1, unit="m")
+    with open_bag(path, topics) as recording:
+        intake = Intake(path, robot.joint_names, topics, settings)
+        damage = intake.drain(recording, progress)
+    streams, found = intake.streams(), intake.standstills
+    if damage and not accept_damaged:
+        counts = ", ".join(f"{s.messages} of {n}" for s, n in zip(streams, recording.promised, strict=True))
+        got = f"{damage}; read: {counts} messages of {', '.join(recording.names)}, {len(found)} standstills"
+        raise FileFormatError(
+            path, "bag", got, "an undamaged bag", "repair it, or accept it with --accept-damaged"
+        )
+    _check_streams(path, streams, robot.joint_names)
+    if not found:
+        raise _no_standstill(path, intake.rejections, streams[0], settings)
+    q, points = np.array([s.joints for s in found]), np.array([s.points for s in found])
+    data = Measurements(robot.joint_names, q, points, mean_std(found, sigma, repeatability))
+    return BagMeasurements(data, tuple(found), tuple(intake.rejections), streams, intake.frame_id, damage)
+
+
+# ── what makes a bag unusable ────────────────────────────────────────────────────────────────────────
+
+
+def _check_streams(path: str | Path, streams: tuple[Stream, ...], joint_names: Sequence[str]) -> None:
+    for number, stream in enumerate(streams):
+        where = f"topic {stream.topic}"
+        if not stream.messages:
+            raise FileFormatError(path, where, "no messages", "at least one standstill's", "was the driver on?")
+        if not stream.usable:
+            got = stream.describe().partition(": ")[2] + (f" ({stream.example})" if stream.example else "")
+            advice = "check the driver and the line of sight"
+            if stream.left_out.get(UNSTAMPED):
+                advice = "the driver has to fill header.stamp"
+            elif stream.left_out.get(UNFIT):
+                advice = f"each message has to name and position {', '.join(joint_names)}"
+            wanted = "stamped, finite points" if number else "stamped, finite positions of the robot's joints"
+            raise FileFormatError(path, where, got, wanted, advice)
+    joints = streams[0]
+    for points in streams[1:]:
+        apart = max(points.first - joints.last, joints.first - points.last)  # type: ignore[operator]
+        if apart > 0:
+            got = " and ".join(
+                f"{s.topic} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (joints, points)
+            )
+            advice = "synchronise the clocks (PTP or NTP) and record again, or correct the stamps"
+            raise FileFormatError(path, "header stamps", got, "streams that overlap in time", advice)
+
+
+def _no_standstill(
+    path: str | Path, rejections: list[Rejection], joints: Stream, settings: StandstillSettings
+) -> FileFormatError:
+    seconds = ((joints.last or 0) - (joints.first or 0)) / NANO
+    got = f"none in {seconds:.1f} s"
+    if rejections:
+        got += "; " + "; ".join(_reasons(rejections))
+        advice = "see the reasons"
+    else:
+        got += f"; the joints never rest within joint_tolerance = {settings.joint_tolerance:g}"
+        advice = "dwell longer, or raise joint_tolerance above the noise of the encoders"
+    rest = settings.settle + settings.duration
+    return FileFormatError(path, "standstills", got, f"the robot at rest for {rest:g} s at least", advice)
+
+
+def _reasons(rejections: list[Rejection] | tuple[Rejection, ...]) -> list[str]:
+    """How many of each reason, with the first one's own words."""
+    counts = Counter(r.reason for r in rejections)
+    first = {r.reason: r.message for r in reversed(rejections)}
+    return [f"{n} rejected as {why.value} ({first[why]})" for why, n in counts.items()]
+
+
+def _seconds(stamp: int | None) -> str:
+    return f"{(stamp or 0) / NANO:.3f} s"
+
+
+# ── Takes a bag's messages one by one: to the standstill detector, or to the count of what was left out and w
+
+REPORT_EVERY = 2000
+"""Messages between two reports of progress."""
+UNREADABLE, UNSTAMPED, UNFIT = "not decodable", "without a stamp", "without the robot's joints"
+NOT_FINITE, DROPPED = "not finite", "too late or twice"
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What became of the messages of a topic.
+
+    Attributes:
+        topic: Its name.
+        messages: Read from the bag.
+        left_out: How many of them took no part, by reason.
+        first, last: Earliest and latest stamp [ns], ``None`` without any.
+        example: What was wrong with the first message that was left out, where there is more to say.
+    """
+
+    topic: str
+    messages: int
+    left_out: dict[str, int]
+    first: int | None
+    last: int | None
+    example: str
+
+    @property
+    def usable(self) -> int:
+        """Messages that are stamped, finite and of the robot, in time or not."""
+        return self.messages - sum(n for why, n in self.left_out.items() if why != DROPPED)
+
+    def describe(self) -> str:
+        """One line: messages, and those left out."""
+        lost = ", ".join(f"{n} {why}" for why, n in self.left_out.items())
+        return f"{self.topic}: {self.messages} messages" + (f", left out: {lost}" if lost else "")
+
+
+@dataclass
+class _Tally:
+    messages: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    first: int | None = None
+    last: int | None = None
+    example: str = ""
+
+    def leave_out(self, why: str, example: str = "") -> None:
+        self.left_out[why] += 1
+        self.example = self.example or example
+
+    def count(self, stamp: int, values: FloatArray) -> None:
+        self.first = stamp if self.first is None else min(stamp, self.first)
+        self.last = stamp if self.last is None else max(stamp, self.last)
+        if not np.isfinite(values).all():
+            self.left_out[NOT_FINITE] += 1
+
+
+class Intake:
+    """Takes messages one by one and collects what they complete.
+
+    Attributes:
+        standstills, rejections: What was found so far, in the order of completion.
+        frame_id: Frame of the points; empty while no message told.
+    """
+
+    def __init__(
+        self, path: str | Path, joint_names: tuple[str, ...], topics: BagTopics, settings: StandstillSettings
+    ) -> None:
+        self.path, self.joint_names, self.names = path, joint_names, topics.names
+        self.standstills: list[Standstill] = []
+        self.rejections: list[Rejection] = []
+        self.frame_id = ""
+        self._detector = StandstillDetector(len(joint_names), len(topics.points), settings)
+        self._tallies = [_Tally() for _ in self.names]
+
+    def drain(self, recording: Recording, progress: Callable[[float, str], None] | None) -> str:
+        """Take all there is; returns what is damaged, in words, or nothing."""
+        total, done, stopped = max(sum(recording.promised), 1), 0, ""
+        try:
+            for stream, data in recording.messages():
+                self._take(stream, recording, data)
+                done += 1
+                if progress is not None and done % REPORT_EVERY == 0:
+                    progress(min(done / total, 1.0), f"{len(self.standstills)} standstills")
+        except BrokenStorage as error:
+            stopped = f"unreadable after {done} messages: {error}"
+        self._sort(self._detector.flush())
+        damage = [recording.unread, stopped]
+        for name, tally, promised in zip(self.names, self._tallies, recording.promised, strict=True):
+            if tally.messages < promised and not stopped:
+                damage.append(f"{promised - tally.messages} of {promised} messages of {name} are missing")
+            if tally.left_out[UNREADABLE]:
+                count = f"{tally.left_out[UNREADABLE]} of {tally.messages} messages"
+                damage.append(f"{count} of {name} cannot be decoded ({tally.example})")
+        return "; ".join(filter(None, damage))
+
+    def streams(self) -> tuple[Stream, ...]:
+        """What became of the messages."""
+        result = []
+        for name, tally, dropped in zip(self.names, self._tallies, self._detector.dropped, strict=True):
+            left_out = dict(tally.left_out + Counter({DROPPED: dropped}))
+            result.append(Stream(name, tally.messages, left_out, tally.first, tally.last, tally.example))
+        return tuple(result)
+
+    def _take(self, stream: int, recording: Recording, data: bytes) -> None:
+        tally = self._tallies[stream]
+        tally.messages += 1
+        try:
+            message = recording.decode(stream, data)
+        except BrokenStorage as error:
+            tally.leave_out(UNREADABLE, str(error))
+            return
+        stamp = int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
+        if stamp <= 0:
+            tally.leave_out(UNSTAMPED)
+            return
+        if stream:
+            xyz = self._point(message)
+            tally.count(stamp, xyz)
+            self._sort(self._detector.add_point(stream - 1, stamp, xyz))
+            return
+        try:
+            joints = pick_joints(message.name, message.position, self.joint_names)
+        except InputError as error:
+            names = f"it names {', '.join(message.name[:MOST_NAMES])}"
+            tally.leave_out(UNFIT, names if isinstance(error, UnknownNameError) else str(error))
+            return
+        tally.count(stamp, joints)
+        self._sort(self._detector.add_joints(stamp, joints))
+
+    def _point(self, message: Any) -> FloatArray:
+        frame = message.header.frame_id
+        if frame and self.frame_id and frame != self.frame_id:
+            got = f"{self.frame_id!r} and {frame!r}"
+            advice = "transform the points, or split the bag where the station changed"
+            raise FileFormatError(self.path, "frame_id of the points", got, "one frame", advice)
+        self.frame_id = self.frame_id or frame
+        return np.array([message.point.x, message.point.y, message.point.z])
+
+    def _sort(self, results: list[Standstill | Rejection]) -> None:
+        for found in results:
+            if isinstance(found, Standstill):
+                self.standstills.append(found)
+            else:
+                self.rejections.append(found)
+
+
+# ── Messages out of a rosbag2 recording, one at a time, whatever its storage; rosbags does the reading ──────
+# A bag is a folder with ``metadata.yaml``, a folder of storage files whose recorder never wrote that, or one
+# storage file (.db3, .mcap). Only the topics asked for are read, and only a chunk at a time is in memory. Their
+# types are those of ROS 2 Jazzy, whatever definitions the bag holds or lacks. Whatever rosbags raises on files
+# that are no bags or are damaged becomes an error of ours.
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+POINT = "geometry_msgs/msg/PointStamped"
+STORAGE = (".db3", ".mcap")
+WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
+REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
+MOST_LISTED = 20
+"""Topics or files that an error lists."""
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """Where the messages are; a leading slash may be left out.
+
+    Attributes:
+        joints: Topic of sensor_msgs/JointState.
+        points: Topics of geometry_msgs/PointStamped, one per target, in the order of the targets.
+    """
+
+    joints: str = "joint_states"
+    points: tuple[str, ...] = ("tracker/point",)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", tuple(self.points))
+        names = self.names
+        if len(names) < 2 or "/" in names or len(set(names)) != len(names):
+            got = ", ".join(map(repr, (self.joints, *self.points)))
+            raise InputError("topics", got, "a topic of joints and one per target, each once")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All topics as a bag names them, that of the joints first."""
+        return tuple("/" + name.strip().strip("/") for name in (self.joints, *self.points))
+
+
+class BrokenStorage(Exception):
+    """Reading stopped before the end; the text says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """An open bag.
+
+    Attributes:
+        names: The topics wanted, as in the bag; their positions are the numbers of the streams.
+        promised: Messages of each topic, as the bag's own index says.
+        unread: What the bag holds but no reader gets at, in words; empty if there is nothing.
+    """
+
+    names: tuple[str, ...]
+    promised: tuple[int, ...]
+    unread: str
+    _readers: tuple[Any, ...]
+    _types: Any
+
+    def messages(self) -> Iterator[tuple[int, bytes]]:
+        """Number of the stream and undecoded message, in the order of recording.
+
+        Raises:
+            BrokenStorage: The storage is damaged here; nothing more can be read.
+        """
+        for reader in self._readers:
+            wanted = [c for c in reader.connections if c.topic in self.names]
+            source = iter(reader.messages(wanted)) if wanted else iter(())
+            while True:
+                try:
+                    connection, _, data = next(source)
+                except StopIteration:
+                    break
+                except Exception as error:  # rosbags lets through what sqlite, zstd, lz4 and struct raise
+                    raise BrokenStorage(reason(error)) from None
+                yield self.names.index(connection.topic), data
+
+    def decode(self, stream: int, data: bytes) -> Any:
+        """The message as an object with the fields of its type.
+
+        Raises:
+            BrokenStorage: These bytes are no such message.
+        """
+        try:
+            return self._types.deserialize_cdr(data, POINT if stream else JOINT_STATE)
+        except Exception as error:
+            raise BrokenStorage(reason(error)) from None
+
+
+@contextmanager
+def open_bag(path: str | Path, topics: BagTopics) -> Iterator[Recording]:
+    """Open a bag for reading the given topics.
+
+    Raises:
+        MissingExtraError: rosbags is not installed.
+        FileFormatError: Not a bag, not readable, a topic missing or of another type.
+    """
+    reader_class, types = _rosbags()
+    with ExitStack() as stack:
+        readers = []
+        for part in storage_parts(path):
+            try:
+                readers.append(stack.enter_context(reader_class(part)))
+            except Exception as error:
+                raise FileFormatError(part, "bag", reason(error), WHAT, REPAIR) from None
+        _check_topics(path, readers, topics.names)
+        promised = tuple(
+            sum(c.msgcount for r in readers for c in r.connections if c.topic == name) for name in topics.names
+        )
+        yield Recording(topics.names, promised, _write_ahead(path), tuple(readers), types)
+
+
+def is_bag(path: str | Path) -> bool:
+    """Whether ``path`` is to be read as a bag rather than as text: a folder, or a storage file by its name."""
+    place = Path(path).expanduser()
+    return place.is_dir() or place.suffix in STORAGE or place.name == "metadata.yaml"
+
+
+def storage_parts(path: str | Path) -> list[Path]:
+    """What to open one after the other: the folder itself if it has metadata, else its storage files.
+
+    Raises:
+        FileFormatError: There is nothing of the kind.
+    """
+    place = Path(path).expanduser()
+    place = place.parent if place.name == "metadata.yaml" else place
+    try:
+        if not place.is_dir():
+            place.open("rb").close()
+            if place.suffix in STORAGE:
+                return [place]
+            advice = "convert it with rosbags-convert" if place.suffix == ".bag" else "give the bag's folder"
+            raise FileFormatError(path, "file", f"a file named {place.name}", WHAT, advice)
+        files = sorted(p for p in place.iterdir())
+    except OSError as error:
+        raise FileFormatError(path, "file", error.strerror or error, WHAT, "check the path") from None
+    if any(p.name == "metadata.yaml" for p in files):
+        return [place]
+    found = sorted((p for p in files if p.suffix in STORAGE), key=_numbered)
+    if found:
+        return found
+    inner = [p.name for p in files if (p / "metadata.yaml").is_file()]
+    advice = f"give one of the folders in it: {_cut(inner)}" if inner else "give the folder that ros2 bag wrote"
+    raise FileFormatError(path, "folder", f"{_cut([p.name for p in files])}", WHAT, advice)
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong in one line, short; the kind of error where it has no text."""
+    text = " ".join(str(error).split())[:300].rstrip(".")
+    return text or type(error).__name__
+
+
+def _rosbags() -> tuple[Any, Any]:
+    """The class that reads bags, and the message types of Jazzy."""
+    try:
+        from rosbags.rosbag2 import Reader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise MissingExtraError("bags", "rosbags", "reading bags") from None
+    return Reader, get_typestore(Stores.ROS2_JAZZY)
+
+
+def _check_topics(path: str | Path, readers: list[Any], names: tuple[str, ...]) -> None:
+    held: dict[str, set[str]] = {}
+    for connection in (c for r in readers for c in r.connections):
+        held.setdefault(connection.topic, set()).add(connection.msgtype)
+    described = _cut([f"{t} ({', '.join(sorted(held[t]))})" for t in sorted(held)])
+    for stream, name in enumerate(names):
+        wanted, option = (POINT, "--point-topic") if stream else (JOINT_STATE, "--joint-topic")
+        fitting = [t for t in sorted(held) if held[t] == {wanted}]
+        close = (get_close_matches(name, fitting, n=1, cutoff=0.3) or fitting)[:1]
+        advice = f"is it {option} {close[0]}?" if close else f"record a topic of type {wanted}"
+        if name not in held:
+            raise FileFormatError(
+                path, f"topic {name}", f"a bag with {described}", f"messages of {wanted}", advice
+            )
+        if held[name] != {wanted}:
+            raise FileFormatError(path, f"topic {name}", ", ".join(sorted(held[name])), wanted, advice)
+
+
+def _write_ahead(path: str | Path) -> str:
+    """Names logs beside SQLite files that still hold messages: the recorder did not end properly."""
+    place = Path(path).expanduser()
+    logs = [place.with_name(place.name + "-wal")] if place.is_file() else sorted(place.glob("*.db3-wal"))
+    full = [p.name for p in logs if p.is_file() and p.stat().st_size]
+    return f"{_cut(full)} holds messages not yet in the .db3 file (open that once with sqlite3)" if full else ""
+
+
+def _numbered(path: Path) -> list[Any]:
+    """Sorts bag_10 after bag_9."""
+    words = re.split(r"([0-9]+)", path.name)
+    return [int(w) if i % 2 else w for i, w in enumerate(words)]
+
+
+def _cut(names: list[str]) -> str:
+    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+    return ", ".join(n[:200] for n in names[:MOST_LISTED]) + more if names else "nothing"

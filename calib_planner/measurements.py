@@ -1,0 +1,84 @@
+"""What was measured: joint angles and the points the tracker saw there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_planner.arrays import FloatArray, check_array, check_configurations
+from calib_planner.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """N configurations and the points measured there (A1, A2 of the paper).
+
+    Attributes:
+        joint_names: Order of the columns of ``configurations``.
+        configurations: (N, joints) [rad | m].
+        points: (N, targets, 3) in the tracker's frame [m]; NaN where a target was not measured.
+        std: (N, targets, 3) standard deviation of each coordinate [m], or ``None`` where unknown.
+    """
+
+    joint_names: tuple[str, ...]
+    configurations: ArrayLike
+    points: ArrayLike
+    std: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "joint_names", tuple(self.joint_names))
+        q = check_configurations("configurations", self.configurations, self.joint_names)
+        put(self, "configurations", q)
+        meaning = "(configurations, targets, xyz) in m"
+        points = check_array("points", self.points, (len(q), None, 3), finite=False, meaning=meaning)
+        if np.isinf(points).any():
+            raise InputError("points", "an infinite coordinate", "finite numbers, NaN if not measured")
+        partly = np.isnan(points).any(axis=2) & ~np.isnan(points).all(axis=2)
+        if partly.any():
+            i, t = (int(v) for v in np.argwhere(partly)[0])
+            raise InputError(f"points[{i}], target {t + 1}", "some of x, y, z", "all three coordinates or none")
+        put(self, "points", points)
+        if self.std is not None:
+            std = check_array("std", self.std, points.shape, finite=False, meaning=meaning)
+            if (std[~np.isnan(points)] <= 0).any() or np.isnan(std[~np.isnan(points)]).any():
+                raise InputError("std", "a value <= 0 or missing", "a standard deviation > 0 [m]")
+            put(self, "std", std)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def q(self) -> FloatArray:
+        """(N, joints), ``configurations`` as the array the constructor made."""
+        return np.asarray(self.configurations)
+
+    @property
+    def p(self) -> FloatArray:
+        """(N, targets, 3), ``points`` as the array the constructor made."""
+        return np.asarray(self.points)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(N, targets), whether each target was measured."""
+        return ~np.isnan(self.p[:, :, 0])
+
+    def select(self, rows: ArrayLike) -> Measurements:
+        """Some of the rows, in the order given."""
+        rows = np.asarray(rows)
+        std = None if self.std is None else np.asarray(self.std)[rows]
+        return Measurements(self.joint_names, self.q[rows], self.p[rows], std)
+
+    def in_order_of(self, joint_names: Sequence[str]) -> Measurements:
+        """The same with the joint columns in another order.
+
+        Raises:
+            InputError: The names are not the same set.
+        """
+        if set(joint_names) != set(self.joint_names):
+            raise InputError("joint names", ", ".join(self.joint_names), f"the robot's: {', '.join(joint_names)}")
+        order = [self.joint_names.index(n) for n in joint_names]
+        return Measurements(tuple(joint_names), self.q[:, order], self.p, self.std)

@@ -1,0 +1,29 @@
+"""Where to measure: a plan problem, the verb ``plan``, the plan, and how good it provably is."""
+
+from calib_planner.planning.budget import Split, plan_for_accuracy, split_budget
+from calib_planner.planning.compare import Comparison, compare, random_accuracies
+from calib_planner.planning.constraints import (
+    JointRange,
+    LineOfSight,
+    MinimumHeight,
+    ReflectorAcceptance,
+    TrackerElevation,
+    TrackerRange,
+    WorkspaceBox,
+)
+from calib_planner.planning.constraints.self_collision import SelfCollision
+from calib_planner.planning.criteria import CRITERIA
+from calib_planner.planning.discrepancy import ModelDiscrepancy
+from calib_planner.planning.feasibility import Constraint, Feasibility
+from calib_planner.planning.information import (
+    InformationModel,
+    covariance,
+    error_variance,
+    plan_space,
+    smallest_size,
+)
+from calib_planner.planning.plan import Plan, plain
+from calib_planner.planning.planner import Progress, plan
+from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
+from calib_planner.planning.tour import DWELL, Pace, timetable, usual_pace, visiting_order

@@ -1,0 +1,86 @@
+"""The paper's baseline: how do random plans fare beside the proposed one? (Table 2)"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib_planner.arrays import FloatArray, check_count
+from calib_planner.errors import InputError
+from calib_planner.planning.information import PlanSpace, plan_space
+from calib_planner.planning.plan import Plan, plain
+from calib_planner.planning.planner import plan
+from calib_planner.planning.problem import PlanProblem
+
+BATCH = 20_000
+"""Configurations evaluated at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One column of Table 2.
+
+    Attributes:
+        label: ``"12"`` or ``"3x4"``.
+        proposed: The plan found.
+        random: (count,) ρ0 of random plans of the same size [m].
+    """
+
+    label: str
+    proposed: Plan
+    random: FloatArray
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers: label, sizes, proposed, lower bound, random {max, min, mean, median} [m]."""
+        found: dict[str, Any] = plain(
+            {
+                "label": self.label,
+                "configurations": len(self.proposed.configurations),
+                "repetitions": int(self.proposed.repetitions[0]),
+                "proposed": self.proposed.predicted_accuracy,
+                "lower_bound": self.proposed.lower_bound,
+                "efficiency": self.proposed.efficiency,
+                "random": {
+                    "count": len(self.random),
+                    "max": self.random.max(),
+                    "min": self.random.min(),
+                    "mean": self.random.mean(),
+                    "median": np.median(self.random),
+                },
+            }
+        )
+        return found
+
+
+def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> list[Comparison]:
+    """A column per (configurations, repetitions).
+
+    Raises:
+        InputError: Another criterion than ``test_pose``.
+    """
+    if problem.criterion != "test_pose" or problem.compound:
+        raise InputError("criterion", problem.criterion, "test_pose")
+    check_count("random", count)
+    columns = []
+    for k, r in sizes:
+        asked = replace(problem, configurations=k, repetitions=r)
+        random = random_accuracies(plan_space(asked), count, np.random.default_rng([problem.seed, k, r]))
+        columns.append(Comparison(str(k) if r == 1 else f"{k}x{r}", plan(asked), random))
+    return columns
+
+
+def random_accuracies(space: PlanSpace, count: int, rng: np.random.Generator) -> FloatArray:
+    """(count,) ρ0 [m] of random feasible plans of the problem's size; huge where nearly singular."""
+    size = space.problem.configurations
+    criterion = space.criterion("test_pose")
+    batch = max(BATCH // size, 1)
+    values = []
+    for first in range(0, count, batch):
+        plans = min(batch, count - first)
+        unit = space.model.at(space.feasibility.sample(rng, plans * size))
+        matrices = unit.reshape(plans, size, *space.prior.shape).sum(axis=1) + space.prior
+        worth = criterion.worth_and_slope(matrices)[0]
+        values.append(np.where(worth > 0, np.maximum(worth, 1e-300) ** -0.5, np.inf))
+    return np.concatenate(values)

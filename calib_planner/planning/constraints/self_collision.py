@@ -1,0 +1,111 @@
+"""No link runs into another: with Pinocchio and Coal, from the collision geometry of a URDF.
+
+Pairs that always touch say nothing: geometries of one body (links joined by fixed joints are one) and of bodies
+that share a joint are left out. Everything else may not intersect. Pinocchio is imported on first use.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner.arrays import FloatArray
+from calib_planner.errors import FileFormatError, InputError, MissingExtraError
+from calib_planner.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCollision:
+    """Allowed are configurations in which no two links, other than neighbours, touch.
+
+    Joints are matched by name; joints of the URDF that the robot does not have (a gripper's) stand at zero.
+
+    Attributes:
+        urdf_path: A URDF with <collision> geometry.
+        package_folder: Where its ``package://`` meshes are, if it has any.
+    """
+
+    urdf_path: str | Path
+    package_folder: str | Path | None = None
+    name: str = "self-collision"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what Pinocchio made: a process that receives this makes its own."""
+        return {k: v for k, v in self.__dict__.items() if k != "_models"}
+
+    @cached_property
+    def _models(self) -> tuple[Any, Any]:
+        """Pinocchio's model, and its geometry model with the pairs that count."""
+        pin = import_pinocchio()
+        path = Path(self.urdf_path).expanduser()
+        if not path.is_file():
+            raise FileFormatError(path, "file", "no such file", "a URDF with collision geometry")
+        folders, kind = [str(self.package_folder or path.parent)], pin.GeometryType.COLLISION
+        try:
+            model = pin.buildModelFromUrdf(str(path))
+            geometry = pin.buildGeomFromUrdf(model, str(path), kind, package_dirs=folders)
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise FileFormatError(path, "URDF", reason, "a URDF with collision geometry") from None
+        bodies = [int(g.parentJoint) for g in geometry.geometryObjects]
+        for i, first in enumerate(bodies):
+            for j, second in enumerate(bodies[:i]):
+                neighbours = first in (second, model.parents[second]) or model.parents[first] == second
+                if not neighbours:
+                    geometry.addCollisionPair(pin.CollisionPair(j, i))
+        if not len(geometry.collisionPairs):
+            got = f"{len(bodies)} shapes"
+            raise FileFormatError(path, "collision geometry", got, "shapes on links that are not neighbours")
+        return model, geometry
+
+    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
+        """(N, joints) → (N,). Pinocchio takes one configuration at a time.
+
+        Raises:
+            MissingExtraError: Pinocchio is not installed.
+            FileFormatError: The URDF cannot be read, or has nothing that can collide.
+            InputError: The URDF lacks a joint of the robot.
+        """
+        pin = import_pinocchio()
+        model, geometry = self._models
+        full = self._coordinates(model, robot, q)
+        data, shapes = model.createData(), geometry.createData()
+        hits = [pin.computeCollisions(model, data, geometry, shapes, row, True) for row in full]
+        return ~np.array(hits, dtype=bool)
+
+    def _coordinates(self, model: Any, robot: Robot, q: FloatArray) -> FloatArray:
+        """(N, nq) Pinocchio's coordinates: joints without limits are (cos, sin) pairs there."""
+        full = np.zeros((len(q), model.nq))
+        for joint in model.joints[1:]:
+            if joint.nq == 2:
+                full[:, joint.idx_q] = 1.0
+        for name, column in zip(robot.joint_names, q.T, strict=True):
+            if not model.existJointName(name):
+                names = ", ".join(list(model.names)[1:])
+                raise InputError(f"joint {name}", f"not in {self.urdf_path}", f"one of its joints: {names}")
+            joint = model.joints[model.getJointId(name)]
+            if joint.nq == 2:
+                full[:, joint.idx_q], full[:, joint.idx_q + 1] = np.cos(column), np.sin(column)
+            else:
+                full[:, joint.idx_q] = column
+        return full
+
+
+def import_pinocchio() -> Any:
+    """The module ``pinocchio`` with collision checking.
+
+    Raises:
+        MissingExtraError: Not installed.
+    """
+    try:
+        import pinocchio
+    except ImportError:
+        raise MissingExtraError("collision", "Pinocchio with Coal", "self-collision") from None
+    if not hasattr(pinocchio, "computeCollisions"):
+        raise MissingExtraError("collision", "Pinocchio with Coal", "self-collision")
+    return pinocchio

@@ -1,0 +1,376 @@
+"""What a plan is worth: information functions of the information matrix M (Pukelsheim, Optimal Design of
+Experiments, 1993).
+
+Every criterion here is written as a function Ψ(M) to be *maximised* that is positive, concave and homogeneous,
+Ψ(cM) = c Ψ(M): twice the measurements, twice the worth. Then with a (super)gradient G = ∂Ψ/∂M
+
+    Ψ(M*) ≤ trace(G M*)       for every M*,                                                            (B)
+
+the supporting hyperplane at M passing through the origin; ``bound`` rests on nothing else. The search
+maximises log Ψ. Three criteria of the calibration literature (O2, O4 and plain conditioning) are not concave;
+they can be searched for but have no bound.
+
+    name        worth Ψ(M)                                value reported
+    test_pose   1 / Σ_k w_k tr(J_k M⁻¹ J_kᵀ)              ρ0 = Ψ^(−1/2) [m], eq. (14)
+    worst_pose  1 / max_k tr(J_k M⁻¹ J_kᵀ)                largest ρ0 [m]
+    d, o1       det(M)^(1/p)                              det(M)^(1/p); O1 = det(M)^(1/2p)/√m
+    d_star      (Π_i (M⁻¹)_ii)^(−1/p)                     the same
+    a           p / tr(M⁻¹)                               tr(M⁻¹)
+    e, o3       λ_min(M)                                  λ_min(M); O3 = √λ_min
+    o5          (tr M^(−1/2) / p)^(−2)                    O5 = 1 / tr M^(−1/2)
+    o2          λ_min / λ_max                             O2 = √(λ_min / λ_max)
+    o4          λ_min² / λ_max                            O4 = λ_min / √λ_max
+
+D: Wald 1943; E: Ehrenfeld 1955; A: Elfving 1952; D*: Klimchik et al.; O1: Borm and Menq 1989; O2: Driels and
+Pathre 1990; O3, O4: Nahvi et al. 1994, 1996; O5: Sun and Hollerbach 2008.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from calib_planner.arrays import FloatArray
+
+CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
+"""Names a request may use."""
+
+
+class Criterion(Protocol):
+    """An information function."""
+
+    @property
+    def concave(self) -> bool:
+        """Whether (B) holds, so that there is a bound."""
+        ...
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``matrices`` (S, p, p) → Ψ (S,), to be maximised, and ∂Ψ/∂M (S, p, p)."""
+        ...
+
+    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+        """G (p, p) of (B) at ``matrix`` for the *exact* criterion, where the search uses a smooth one."""
+        ...
+
+    def exact(self, matrix: FloatArray) -> float:
+        """Ψ itself at one matrix (p, p), unsmoothed."""
+        ...
+
+
+def _symmetric(slope: FloatArray) -> FloatArray:
+    return 0.5 * (slope + np.swapaxes(slope, -1, -2))
+
+
+class _Smooth:
+    """What a differentiable criterion need not write."""
+
+    concave = True
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        raise NotImplementedError
+
+    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+        return self.worth_and_slope(matrix[None])[1][0]
+
+    def exact(self, matrix: FloatArray) -> float:
+        return float(self.worth_and_slope(matrix[None])[0][0])
+
+
+@dataclass(frozen=True)
+class Accuracy(_Smooth):
+    """1 / trace(A M⁻¹): eq. (14), for one or several test poses, or the A-criterion with A = I/p.
+
+    Attributes:
+        weight: (p, p) the matrix A, symmetric and positive semi-definite.
+    """
+
+    weight: FloatArray
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inverse = np.linalg.inv(matrices)
+        half = inverse @ self.weight
+        worth = 1.0 / np.einsum("sii->s", half)
+        return np.asarray(worth, np.float64), _symmetric((worth**2)[:, None, None] * (half @ inverse))
+
+
+@dataclass(frozen=True)
+class WorstAccuracy:
+    """1 / max_k trace(A_k M⁻¹): the worst of several test poses.
+
+    The search uses the power mean Σ_k (…)^s with s = ``sharpness`` for the maximum. For (B) any mixture
+    Σ λ_k A_k gives a valid slope, since the largest is at least the mixture; the power mean supplies λ.
+
+    Attributes:
+        weights: (K, p, p) the matrices A_k.
+    """
+
+    weights: FloatArray
+    sharpness: float = 16.0
+    concave: bool = True
+
+    def _values(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inverse = np.linalg.inv(matrices)
+        return np.asarray(inverse, np.float64), np.einsum("sab,kba->sk", inverse, self.weights)
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inverse, values = self._values(matrices)
+        top = values.max(axis=1, keepdims=True)
+        powers = (values / top) ** self.sharpness
+        total = powers.mean(axis=1)
+        worth = 1.0 / (top[:, 0] * total ** (1.0 / self.sharpness))
+        share = powers / values / (total * len(self.weights))[:, None]
+        mixed = np.einsum("sk,kab->sab", share, self.weights)
+        return worth, _symmetric(worth[:, None, None] * (inverse @ mixed @ inverse))
+
+    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+        _, values = self._values(matrix[None])
+        powers = (values[0] / values[0].max()) ** self.sharpness / values[0]
+        mixed = np.einsum("k,kab->ab", powers / powers.sum(), self.weights)
+        return Accuracy(mixed).supporting_slope(matrix)
+
+    def exact(self, matrix: FloatArray) -> float:
+        return float(1.0 / self._values(matrix[None])[1].max())
+
+
+@dataclass(frozen=True)
+class Determinant(_Smooth):
+    """det(M)^(1/p): the D-criterion, invariant under the units of the parameters up to a constant."""
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        size = matrices.shape[-1]
+        sign, log = np.linalg.slogdet(matrices)
+        worth = np.where(sign > 0, np.exp(log / size), 0.0)
+        return worth, _symmetric(worth[:, None, None] / size * np.linalg.inv(matrices))
+
+
+@dataclass(frozen=True)
+class DiagonalDeterminant(_Smooth):
+    """(Π (M⁻¹)_ii)^(−1/p): D*, small variances *and* independence, since Π (M⁻¹)_ii ≥ det M⁻¹."""
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        size = matrices.shape[-1]
+        inverse = np.linalg.inv(matrices)
+        diagonal = np.einsum("sii->si", inverse)
+        worth = np.exp(-np.log(np.maximum(diagonal, 1e-300)).mean(axis=1))
+        middle = inverse / diagonal[:, None, :]
+        return worth, _symmetric(worth[:, None, None] / size * (middle @ inverse))
+
+
+@dataclass(frozen=True)
+class PowerMean:
+    """(tr M^(−s) / p)^(−1/s): s = 1 is A, s = ½ is O5, s → ∞ is E (searched with s = 8, reported exactly)."""
+
+    power: float
+    smallest: bool = False
+    concave: bool = True
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        s = self.power
+        values, vectors = np.linalg.eigh(matrices)
+        values = np.maximum(values, 1e-300)
+        lowest = values[:, :1]
+        scaled = (lowest / values) ** s
+        worth = lowest[:, 0] * scaled.mean(axis=1) ** (-1.0 / s)
+        weights = worth[:, None] * scaled / values / scaled.sum(axis=1, keepdims=True)
+        return worth, np.einsum("sik,sk,sjk->sij", vectors, weights, vectors)
+
+    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+        if not self.smallest:
+            return self.worth_and_slope(matrix[None])[1][0]
+        values, vectors = np.linalg.eigh(matrix)
+        weights = (values[0] / np.maximum(values, 1e-300)) ** (self.power + 1.0)
+        return (vectors * (weights / weights.sum())) @ vectors.T
+
+    def exact(self, matrix: FloatArray) -> float:
+        if self.smallest:
+            return float(max(np.linalg.eigvalsh(matrix)[0], 0.0))
+        return float(self.worth_and_slope(matrix[None])[0][0])
+
+
+@dataclass(frozen=True)
+class EigenvalueRatio:
+    """λ_min^a / λ_max: O2 (a = 1) and O4 (a = 2); not concave, searched through power means."""
+
+    numerator: float
+    power: float = 8.0
+    concave: bool = False
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        values, vectors = np.linalg.eigh(matrices)
+        values = np.maximum(values, 1e-300)
+        s, a = self.power, self.numerator
+        low = (values[:, :1] / values) ** s
+        high = (values / values[:, -1:]) ** s
+        smallest = values[:, 0] * low.sum(axis=1) ** (-1.0 / s)
+        largest = values[:, -1] * high.sum(axis=1) ** (1.0 / s)
+        worth = smallest**a / largest
+        d_log = a * low / low.sum(axis=1, keepdims=True) - high / high.sum(axis=1, keepdims=True)
+        weights = worth[:, None] * d_log / values
+        return worth, np.einsum("sik,sk,sjk->sij", vectors, weights, vectors)
+
+    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+        raise NotImplementedError("this criterion is not concave: it has no bound")
+
+    def exact(self, matrix: FloatArray) -> float:
+        values = np.linalg.eigvalsh(matrix)
+        return float(max(values[0], 0.0) ** self.numerator / values[-1])
+
+
+@dataclass(frozen=True)
+class Compound(_Smooth):
+    """Π_i (Ψ_i / r_i)^(w_i): a weighted geometric mean of efficiencies; concave and homogeneous if all are.
+
+    Attributes:
+        criteria: The parts, all concave.
+        shares: (n,) weights, summing to one.
+        references: (n,) the best known worth r_i of each, per measurement.
+    """
+
+    criteria: tuple[Criterion, ...]
+    shares: tuple[float, ...]
+    references: tuple[float, ...]
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        parts = [c.worth_and_slope(matrices) for c in self.criteria]
+        log = sum(
+            w * np.log(np.maximum(psi / r, 1e-300))
+            for w, r, (psi, _) in zip(self.shares, self.references, parts, strict=True)
+        )
+        worth = np.exp(log)
+        slope = sum((w * worth / psi)[:, None, None] * g for w, (psi, g) in zip(self.shares, parts, strict=True))
+        return worth, np.asarray(slope)
+
+
+@dataclass(frozen=True)
+class Eliminating:
+    """A criterion of the parameters of interest, the nuisance ones eliminated.
+
+    What M says about the first block once the second is estimated with it is the Schur complement
+
+        S = M_ii − M_in M_nn⁻¹ M_ni = Kᵀ M K,   K = [I; −M_nn⁻¹ M_ni],
+
+    concave in M and homogeneous; by the envelope theorem ∂Ψ(S)/∂M = K G Kᵀ.
+
+    Attributes:
+        inner: The criterion of the parameters of interest.
+        interest: Indices of the parameters of interest.
+        nuisance: Indices of the others.
+    """
+
+    inner: Criterion
+    interest: tuple[int, ...]
+    nuisance: tuple[int, ...]
+
+    @property
+    def concave(self) -> bool:
+        return self.inner.concave
+
+    def _reduce(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        i, n = list(self.interest), list(self.nuisance)
+        cross = matrices[:, n][:, :, i]
+        solved = np.linalg.solve(matrices[:, n][:, :, n], cross)
+        lift = np.zeros((len(matrices), matrices.shape[1], len(i)))
+        lift[:, i] = np.eye(len(i))
+        lift[:, n] = -solved
+        schur = matrices[:, i][:, :, i] - np.swapaxes(cross, 1, 2) @ solved
+        return _symmetric(schur), lift
+
+    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        schur, lift = self._reduce(matrices)
+        worth, slope = self.inner.worth_and_slope(schur)
+        return worth, lift @ slope @ np.swapaxes(lift, 1, 2)
+
+    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+        schur, lift = self._reduce(matrix[None])
+        return lift[0] @ self.inner.supporting_slope(schur[0]) @ lift[0].T
+
+    def exact(self, matrix: FloatArray) -> float:
+        return self.inner.exact(self._reduce(matrix[None])[0][0])
+
+
+def accuracy_weights(jacobians: FloatArray) -> FloatArray:
+    """(K, p, p) matrices A_k = J_kᵀJ_k / targets of (K, 3·targets, p) Jacobians at test poses."""
+    return np.einsum("kia,kib->kab", jacobians, jacobians) / (jacobians.shape[1] / 3)
+
+
+def make_criterion(
+    name: str, size: int, test_weights: FloatArray, shares: Sequence[float] | FloatArray
+) -> Criterion:
+    """The criterion of that name.
+
+    Args:
+        name: One of ``CRITERIA``.
+        size: p, number of parameters of interest.
+        test_weights: (K, p, p) from ``accuracy_weights``.
+        shares: (K,) weights of the test poses.
+    """
+    share = np.asarray(shares, float) / np.sum(shares)
+    if name == "worst_pose":
+        return WorstAccuracy(test_weights)
+    if name in ("d", "o1"):
+        return Determinant()
+    if name == "d_star":
+        return DiagonalDeterminant()
+    if name == "a":
+        return Accuracy(np.eye(size) / size)
+    if name in ("e", "o3"):
+        return PowerMean(8.0, smallest=True)
+    if name == "o5":
+        return PowerMean(0.5)
+    if name in ("o2", "o4"):
+        return EigenvalueRatio(1.0 if name == "o2" else 2.0)
+    return Accuracy(np.einsum("k,kab->ab", share, test_weights))
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a criterion's worth is told to people.
+
+    Attributes:
+        unit: Unit of the value; empty where it depends on the parameters' units.
+        sense: ``"min"`` or ``"max"``: whether smaller or larger values are better.
+    """
+
+    unit: str
+    sense: str
+
+
+REPORTS = {
+    "test_pose": Report("m", "min"),
+    "worst_pose": Report("m", "min"),
+    "d": Report("", "max"),
+    "d_star": Report("", "max"),
+    "a": Report("", "min"),
+    "e": Report("", "max"),
+    "o1": Report("", "max"),
+    "o2": Report("1", "max"),
+    "o3": Report("", "max"),
+    "o4": Report("", "max"),
+    "o5": Report("", "max"),
+}
+
+
+def reported_value(name: str, worth: float, size: int, measurements: int) -> float:
+    """The value of the table at the top for a worth Ψ."""
+    if worth <= 0:
+        return float("inf") if REPORTS[name].sense == "min" else 0.0
+    if name in ("test_pose", "worst_pose"):
+        return float(worth**-0.5)
+    if name == "a":
+        return size / worth
+    if name == "o1":
+        return float(np.sqrt(worth / measurements))
+    if name in ("o2", "o3", "o4"):
+        return float(np.sqrt(worth))
+    if name == "o5":
+        return float(np.sqrt(worth)) / size
+    return worth
+
+
+def efficiency(name: str, worth: float, bound: float) -> float:
+    """Value over bound in the criterion's own convention, at most 1: √(Ψ/Ψ*) for accuracies, Ψ/Ψ* else."""
+    ratio = worth / bound if bound > 0 else 0.0
+    return float(np.sqrt(max(ratio, 0.0))) if name in ("test_pose", "worst_pose") else float(ratio)

@@ -1,0 +1,168 @@
+"""Which configurations may be measured at all.
+
+A constraint has a name and says, for a batch of configurations, which of them it allows. The joint limits are
+not among the constraints: every search keeps to them, and to the ``JointRange``s that narrow them, by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.errors import InfeasibleError
+from calib_planner.planning.constraints.room import JointRange, PostureConstraint
+from calib_planner.robot import Posture, Robot
+
+PATIENCE = 200_000
+"""Random configurations tried before a set of constraints is called empty, or nearly so."""
+RARE = 0.01
+"""Share of feasible configurations from which on rejection alone supplies as many as are wanted."""
+WITNESSES = 20_000
+"""Random configurations that show which constraint empties the set."""
+
+
+class Constraint(Protocol):
+    """One condition on configurations."""
+
+    @property
+    def name(self) -> str:
+        """How messages call it."""
+        ...
+
+    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
+        """(N, joints) → (N,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Feasibility:
+    """All constraints of a problem together.
+
+    Attributes:
+        robot: The robot they are about.
+        constraints: The constraints; none means the joint limits alone.
+    """
+
+    robot: Robot
+    constraints: tuple[Constraint, ...] = ()
+
+    @cached_property
+    def limits(self) -> FloatArray:
+        """(joints, 2) the robot's joint limits, cut down to every ``JointRange`` [rad | m].
+
+        Raises:
+            InfeasibleError: Nothing is left of a joint's range.
+        """
+        limits = np.array(self.robot.joint_limits)
+        for constraint in self.constraints:
+            if isinstance(constraint, JointRange):
+                own = constraint.limits(self.robot)
+                limits = np.stack([np.maximum(limits[:, 0], own[:, 0]), np.minimum(limits[:, 1], own[:, 1])], 1)
+        for name, (low, high) in zip(self.robot.joint_names, limits, strict=True):
+            if not low < high:
+                ranges = " and ".join(c.name for c in self.constraints if isinstance(c, JointRange))
+                raise InfeasibleError(ranges, f"they leave nothing of {name}: from {low:g} to {high:g}")
+        return limits
+
+    def mask(self, q: FloatArray) -> NDArray[np.bool_]:
+        """(N, joints) → (N,): allowed by every constraint."""
+        left: IntArray = np.arange(len(q))
+        posture: Posture | None = None
+        for constraint in self.constraints:
+            if not isinstance(constraint, PostureConstraint):
+                ok = constraint.allowed(self.robot, q[left])
+            else:
+                posture = self.robot.posture(q[left]) if posture is None else posture
+                ok = constraint.holds(self.robot, posture)
+            if ok.all():
+                continue
+            left = left[ok]
+            if not left.size:
+                break
+            posture = None if posture is None else posture.rows(np.flatnonzero(ok))
+        mask = np.zeros(len(q), bool)
+        mask[left] = True
+        return mask
+
+    def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """(count, joints) random feasible configurations.
+
+        Uniform within the limits, those that break a constraint rejected. Where nearly all are, the few found
+        are multiplied by random steps from them.
+
+        Raises:
+            InfeasibleError: None was found; names the constraint, or the combination, that empties the set.
+        """
+        low, high = self.limits.T
+        if not self.constraints:
+            return rng.uniform(low, high, (count, len(low)))
+        found: list[FloatArray] = []
+        have, tried, batch = 0, 0, max(4 * count, 1024)
+        while have < count and (tried < PATIENCE or have > RARE * tried):
+            q = rng.uniform(low, high, (min(batch, 20_000), len(low)))
+            good = q[self.mask(q)]
+            found.append(good)
+            have, tried = have + len(good), tried + len(q)
+        if not have:
+            raise self._empty(
+                rng.uniform(low, high, (WITNESSES, len(low))), "random configurations within the joint limits"
+            )
+        return self._multiplied(rng, np.concatenate(found), count)[:count]
+
+    def check_pool(self, pool: FloatArray, count: int) -> None:
+        """Refuse a pool (C, joints) of which fewer than ``count`` configurations are feasible.
+
+        Raises:
+            InfeasibleError: Names the constraint, or the combination, that empties the pool.
+        """
+        allowed = int(self.mask(pool).sum())
+        if not allowed:
+            raise self._empty(pool, "candidates")
+        if allowed < count:
+            text = f"{allowed} of {len(pool)} satisfy the constraints, {count} are wanted"
+            raise InfeasibleError("candidates", f"{text} ({self._table(pool)[1]})")
+
+    def _multiplied(self, rng: np.random.Generator, found: FloatArray, count: int) -> FloatArray:
+        """At least ``count`` rows: ``found`` and feasible neighbours of it, from steps as long as they may be."""
+        low, high = self.limits.T
+        step = 0.1
+        while len(found) < count:
+            origin = found[rng.integers(len(found), size=4096)]
+            q = np.clip(origin + step * (high - low) * rng.normal(size=origin.shape), low, high)
+            good = q[self.mask(q)]
+            found = np.concatenate([found, good])
+            step = min(2 * step, 0.1) if len(good) > 400 else step / 2
+        return found
+
+    def _table(self, q: FloatArray) -> tuple[list[NDArray[np.bool_]], str]:
+        """What each constraint allows of ``q`` (N, joints), as masks (N,) and as text."""
+        masks = [c.allowed(self.robot, q) for c in self.constraints]
+        rows = zip(self.constraints, masks, strict=True)
+        return masks, ", ".join(f"{c.name} allows {100 * m.mean():.2g} %" for c, m in rows)
+
+    def _empty(self, q: FloatArray, what: str) -> InfeasibleError:
+        """The smallest combination of constraints that no row of ``q`` (N, joints) satisfies."""
+        masks, table = self._table(q)
+        which = range(len(masks))
+        guilty = next(
+            (
+                chosen
+                for size in range(1, len(masks) + 1)
+                for chosen in combinations(which, size)
+                if not np.all([masks[i] for i in chosen], axis=0).any()
+            ),
+            tuple(which),
+        )
+        names = " and ".join(self.constraints[i].name for i in guilty)
+        if len(guilty) == 1:
+            return InfeasibleError(
+                names, f"none of {len(q)} {what} within the joint limits satisfies it ({table})"
+            )
+        text = f"each allows some of {len(q)} {what}, all together none ({table}); relax one"
+        return InfeasibleError(names, text)

@@ -1,0 +1,323 @@
+"""What a set of configurations tells about the parameters: the information matrix of eqs. (10) and (11).
+
+Measuring configuration q r times gives, with the point covariance Σ(p) of the instrument and an error of the
+configuration itself that repetition does not average away (robot repeatability, standard deviation σ_c),
+
+    I(q) = J(q)ᵀ W(q) J(q),      W = (Σ(p(q))/r + σ_c² I)⁻¹  per target,
+    M = M_0 + Σ_i I(q_i),        cov(Π̂) = M⁻¹,
+
+M_0 being what is known beforehand (prior standard deviations, earlier measurements). For Σ = σ² I, σ_c = 0 and
+M_0 = 0 this is eq. (11). All matrices are in physical units, 1/(parameter unit)².
+
+Gradient. For ψ(M) with slope G, dψ = Σ_i tr(G dI(q_i)) and
+
+    tr(G dI) = 2 tr(G Jᵀ W dJ) − tr(K dΣ)/r,     K = W J G Jᵀ W  per target:
+
+the first term goes back to the joints by ``Linearisation.pull_back``, the second by ∂Σ/∂p and ∂p/∂q.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_planner.arrays import FloatArray
+from calib_planner.errors import InfeasibleError
+from calib_planner.planning.criteria import (
+    Accuracy,
+    Criterion,
+    Eliminating,
+    accuracy_weights,
+    make_criterion,
+)
+from calib_planner.planning.feasibility import Feasibility
+from calib_planner.planning.problem import PlanProblem
+from calib_planner.robot import Identifiability, Linearisation, Robot, analyse
+from calib_planner.tracker import Isotropic, Noise, covariance_gradient
+
+RANK_TOLERANCE = 1e-9
+"""Eigenvalues of a scaled information matrix below this share of the largest count as zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class InformationModel:
+    """How configurations turn into information.
+
+    Attributes:
+        robot: Its active parameters are the order of all matrices.
+        noise: Covariance of one measured point.
+        configuration_sigma: σ_c [m].
+        repetitions: r, measurements at each configuration.
+    """
+
+    robot: Robot
+    noise: Noise
+    configuration_sigma: float = 0.0
+    repetitions: int = 1
+
+    def at(self, q: FloatArray) -> FloatArray:
+        """I(q) of each configuration: (N, joints) → (N, p, p)."""
+        points, jacobian = self.robot.positions_and_jacobian(q)
+        jacobian = np.ascontiguousarray(jacobian)
+        return np.swapaxes(jacobian, 1, 2) @ self._weigh(points, jacobian)
+
+    def whitened(self, q: FloatArray) -> FloatArray:
+        """Rows W^½ J with I(q) = rowsᵀ rows: (N, joints) → (N, 3·targets, p)."""
+        points, jacobian = self.robot.positions_and_jacobian(q)
+        jacobian = np.ascontiguousarray(jacobian)
+        if isinstance(self.noise, Isotropic):
+            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2)
+        whitener = np.linalg.inv(np.linalg.cholesky(self._covariance(points)))
+        return (whitener @ jacobian.reshape(*points.shape, -1)).reshape(jacobian.shape)
+
+    def linearised(self, q: FloatArray) -> LinearisedInformation:
+        """The same with what its gradient needs."""
+        lin = self.robot._linearise(q, np.zeros(len(self.robot.parameter_names)))
+        jacobian = lin.jacobian()
+        weighted = self._weigh(lin.points.transpose(2, 0, 1), jacobian)
+        return LinearisedInformation(self, lin, jacobian, weighted)
+
+    def _weigh(self, points: FloatArray, jacobian: FloatArray) -> FloatArray:
+        """W J, (N, 3·targets, p)."""
+        if isinstance(self.noise, Isotropic):
+            variance = self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2
+            return jacobian / variance
+        blocks = jacobian.reshape(*points.shape, -1)
+        return (np.linalg.inv(self._covariance(points)) @ blocks).reshape(jacobian.shape)
+
+    def _covariance(self, points: FloatArray) -> FloatArray:
+        common = self.configuration_sigma**2 * np.eye(3)
+        return self.noise.covariance(points) / self.repetitions + common
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedInformation:
+    """I(q) at a batch of configurations, ready to be differentiated.
+
+    Attributes:
+        model: Where it comes from.
+        lin: The chain's linearisation.
+        jacobian: (N, 3·targets, p) J.
+        weighted: (N, 3·targets, p) W J.
+    """
+
+    model: InformationModel
+    lin: Linearisation
+    jacobian: FloatArray
+    weighted: FloatArray
+
+    def sums(self, size: int) -> FloatArray:
+        """Σ I over each run of ``size`` configurations: (N/size, p, p)."""
+        rows, p = size * self.jacobian.shape[1], self.jacobian.shape[2]
+        left = self.jacobian.reshape(-1, rows, p)
+        return np.swapaxes(left, 1, 2) @ self.weighted.reshape(-1, rows, p)
+
+    def gradient(self, slopes: FloatArray) -> FloatArray:
+        """∂ψ/∂q (N, joints) for slopes G: (N/size, p, p), each serving a run of ``size`` configurations."""
+        n, rows, p = self.jacobian.shape
+        targets = rows // 3
+        size = n // len(slopes)
+        pull = (self.weighted.reshape(len(slopes), size * rows, p) @ slopes).reshape(n, rows, p)
+        weights = 2.0 * pull.transpose(2, 1, 0)
+        gradient = self.lin.pull_back(weights.reshape(p, targets, 3, n))
+        noise = self.model.noise
+        if isinstance(noise, Isotropic):
+            return gradient
+        points = self.lin.points.transpose(2, 0, 1)
+        blocks = pull.reshape(n, targets, 3, p) @ np.swapaxes(self.weighted.reshape(n, targets, 3, p), -1, -2)
+        slope = covariance_gradient(noise, points) / self.model.repetitions
+        force = -np.einsum("ntij,ntijx->ntx", blocks, slope)
+        return gradient + np.einsum("ntx,jtxn->nj", force, self.lin.joint_columns)
+
+
+def covariance(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse of an information matrix on the space it spans, and a basis of the rest.
+
+    Scaled to unit diagonal first, so that the rank does not depend on the units of the parameters.
+
+    Returns:
+        (p, p) pseudo-inverse, and (p, p − rank) directions that the data cannot see (unit columns).
+    """
+    diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(diagonal > 0, diagonal, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    seen = values > RANK_TOLERANCE * max(float(values[-1]), 1e-300)
+    basis = vectors[:, seen] / scale[:, None]
+    hidden = vectors[:, ~seen] / scale[:, None]
+    if hidden.size:
+        hidden = hidden / np.linalg.norm(hidden, axis=0)
+    return (basis / values[seen]) @ basis.T, hidden
+
+
+def error_variance(test_jacobian: FloatArray, matrix: FloatArray) -> float:
+    """ρ0² of eq. (14) for J0 (3·targets, p): infinite if J0 needs what the plan cannot see.
+
+    With several targets, the mean over the targets of the squared distance.
+    """
+    inverse, hidden = covariance(matrix)
+    if hidden.size and np.abs(test_jacobian @ hidden).max() > 1e-6 * np.abs(test_jacobian).max():
+        return float("inf")
+    targets = test_jacobian.shape[0] / 3
+    return float(np.einsum("ij,jk,ik->", test_jacobian, inverse, test_jacobian)) / targets
+
+
+# ── A plan problem made ready for numbers: identifiable parameters, prior information, the criterion ────────
+# Parameters that no configuration can tell apart are taken out first (see ``identifiability``), so that every
+# matrix below is invertible for some plan. What is known beforehand enters as M_0.
+
+SAMPLE = 512
+"""Random configurations that stand for the whole workspace."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanSpace:
+    """The problem in parameters that some plan can tell apart; p of them, q of interest.
+
+    Attributes:
+        problem: What was asked.
+        robot: Active in the identifiable parameters only.
+        identifiability: Which of the problem's parameters those are.
+        interest: Indices (among p) of the parameters that are not nuisance.
+        model: Information of one configuration, repeated as asked.
+        single: Information of one measurement.
+        prior: (p, p) M_0.
+        feasibility: The constraints.
+        test_jacobians: (K, 3·targets, p) at the test poses, nuisance columns zero.
+        general: (p, p) mean accuracy weight over the workspace, nuisance zero.
+        sample: (p, p) mean information of one measurement over the workspace.
+    """
+
+    problem: PlanProblem
+    robot: Robot
+    identifiability: Identifiability
+    interest: tuple[int, ...]
+    model: InformationModel
+    single: InformationModel
+    prior: FloatArray
+    feasibility: Feasibility
+    test_jacobians: FloatArray
+    general: FloatArray
+    sample: FloatArray
+
+    def criterion(self, name: str) -> Criterion:
+        """The criterion of that name over the p parameters, nuisance eliminated."""
+        p, inner = len(self.robot.parameter_names), list(self.interest)
+        tests = accuracy_weights(self.test_jacobians[:, :, inner])
+        made = make_criterion(name, len(inner), tests, self.problem.weight_array)
+        if len(inner) == p:
+            return made
+        return Eliminating(made, self.interest, tuple(i for i in range(p) if i not in self.interest))
+
+    def search_criterion(self) -> Criterion:
+        """What the search maximises: the criterion asked for, kept from going blind elsewhere."""
+        share = self.problem.general_weight
+        plain = self.criterion(self.problem.criterion)
+        inner = plain.inner if isinstance(plain, Eliminating) else plain
+        if self.problem.criterion != "test_pose" or not isinstance(inner, Accuracy) or share == 0:
+            return plain
+        keep = np.ix_(self.interest, self.interest)
+        mixed = Accuracy((1.0 - share) * inner.weight + share * self.general[keep])
+        if isinstance(plain, Eliminating):
+            return Eliminating(mixed, plain.interest, plain.nuisance)
+        return mixed
+
+
+def plan_space(problem: PlanProblem) -> PlanSpace:
+    """Prepare a problem.
+
+    Raises:
+        InfeasibleError: The constraints leave nothing, no parameter can be identified, or the number of
+            configurations cannot identify them whichever they are.
+    """
+    names = problem.robot.parameter_names
+    feasibility = Feasibility(problem.robot, problem.constraints)
+    q = _representative(problem, feasibility)
+    jacobians = np.ascontiguousarray(problem.robot.jacobian(q))
+    prior_rows = _prior_rows(problem)
+    stacked = np.concatenate([jacobians.reshape(-1, len(names)), prior_rows * problem.instrument.typical])
+    found = analyse(stacked, names)
+    kept = sorted(found.kept)
+    if not kept:
+        raise InfeasibleError(
+            "parameters",
+            f"no measurement of these targets depends on {', '.join(names)}; choose other parameters, or "
+            "give the tool a target off the last axis",
+        )
+    prior = prior_rows.T @ prior_rows
+    _check_enough(problem, jacobians[:, :, kept], prior[np.ix_(kept, kept)])
+    robot = replace(problem.robot, joint_limits=feasibility.limits).with_parameters([names[i] for i in kept])
+    interest = tuple(
+        i for i, n in enumerate(robot.parameter_names) if not n.startswith(("base.", "target_"))
+    ) or tuple(range(len(kept)))
+    mask = np.isin(np.arange(len(kept)), interest)
+    tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(kept)))
+    if len(problem.test_pose_array):
+        tests = robot.jacobian(problem.test_pose_array) * mask
+    single = InformationModel(robot, problem.instrument, problem.configuration_sigma)
+    return PlanSpace(
+        problem=problem,
+        robot=robot,
+        identifiability=found,
+        interest=interest,
+        model=InformationModel(robot, problem.instrument, problem.configuration_sigma, problem.repetitions),
+        single=single,
+        prior=prior[np.ix_(kept, kept)],
+        feasibility=feasibility,
+        test_jacobians=tests,
+        general=accuracy_weights(jacobians[:, :, kept] * mask).mean(axis=0),
+        sample=single.at(q).mean(axis=0),
+    )
+
+
+def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArray:
+    """Configurations that stand for all a plan may use; the same for every seed."""
+    rng = np.random.default_rng(0)
+    if problem.candidates is None:
+        return feasibility.sample(rng, SAMPLE)
+    pool = np.asarray(problem.candidates)
+    feasibility.check_pool(pool, 1 if problem.repeat_candidates else problem.configurations)
+    return pool if len(pool) <= SAMPLE else pool[rng.choice(len(pool), SAMPLE, replace=False)]
+
+
+def _prior_rows(problem: PlanProblem) -> FloatArray:
+    """(rows, P) whitened equations known beforehand: M_0 = rowsᵀ rows."""
+    names = problem.robot.parameter_names
+    rows: list[FloatArray] = [np.zeros((0, len(names)))]
+    for name, std in problem.prior_std.items():
+        rows.append((np.arange(len(names)) == names.index(name))[None] / std)
+    if problem.measured is not None:
+        data = problem.measured
+        points, jacobian = problem.robot.positions_and_jacobian(data.q)
+        noise = problem.instrument.covariance(points) + problem.configuration_sigma**2 * np.eye(3)
+        whitener = np.linalg.inv(np.linalg.cholesky(noise))
+        whitened = whitener @ jacobian.reshape(*points.shape, -1)
+        rows.append(whitened[data.seen].reshape(-1, len(names)))
+    return np.concatenate(rows)
+
+
+def _check_enough(problem: PlanProblem, jacobians: FloatArray, prior: FloatArray) -> None:
+    """Refuse what so few configurations cannot identify, whichever they are."""
+    needed, per_row, unknown = _needed(jacobians, prior)
+    if problem.configurations < needed:
+        raise InfeasibleError(
+            "configurations",
+            f"{problem.configurations} configurations give at most "
+            f"{problem.configurations * per_row} equations for {unknown} identifiable parameters; ask for "
+            f"at least {needed}, or for fewer parameters",
+        )
+
+
+def _needed(jacobians: FloatArray, prior: FloatArray) -> tuple[int, int, int]:
+    """Configurations needed, equations that each gives, parameters that are not known beforehand."""
+    known = int(np.linalg.matrix_rank(prior)) if prior.any() else 0
+    unknown = jacobians.shape[2] - known
+    per_row = max(int(np.linalg.matrix_rank(j)) for j in jacobians[:8])
+    return -(-unknown // per_row), per_row, unknown
+
+
+def smallest_size(problem: PlanProblem) -> int:
+    """The smallest number of configurations that could identify the problem's parameters, at least 1."""
+    space = plan_space(replace(problem, configurations=len(problem.robot.parameter_names)))
+    q = _representative(problem, space.feasibility)[:8]
+    return max(_needed(np.ascontiguousarray(space.robot.jacobian(q)), space.prior)[0], 1)

@@ -1,0 +1,392 @@
+"""The verb: ``plan(problem)`` → ``Plan``. Prepare, relax, search, prove what was reached.
+
+The relaxed problem comes first: its optimum is the bound, and its support is where good plans are. Then the
+search, in independent parts that any ``concurrent.futures`` executor may do. Compound criteria are
+geometric means of efficiencies, so their parts' relaxed optima are found before them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_planner.arrays import FloatArray, one_thread
+from calib_planner.planning.bound import RelaxedDesign, RelaxedProblem, relaxed_design
+from calib_planner.planning.certify.prove import Proof, prove_bound
+from calib_planner.planning.criteria import (
+    Compound,
+    Criterion,
+    efficiency,
+    reported_value,
+)
+from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
+from calib_planner.planning.plan import STATUS, Plan
+from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.planning.search.exchange import PoolProblem, choose
+from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
+from calib_planner.planning.search.prediction import choose_for_prediction, prediction_problem
+from calib_planner.planning.tour import visiting_order
+from calib_planner.robot import NO_LEVER
+
+GOOD_ENOUGH = 0.012
+"""Distance of a plan's worth from its bound, as a share, at which the search ends; half as much in ρ0."""
+
+AGREEMENT = 2e-4
+"""Difference of log worths below which two parts of the search have found the same plan."""
+
+__all__ = ["Progress", "plan", "worth_of"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a callback is told while the planner works.
+
+    Attributes:
+        starts_done, starts_total: Descents finished and asked for.
+        best_accuracy: Best value of the criterion so far (ρ0 [m] for test poses); NaN before the first.
+        lower_bound: Bound on that value; NaN before it is known.
+        seconds: Time spent.
+    """
+
+    starts_done: int
+    starts_total: int
+    best_accuracy: float
+    lower_bound: float
+    seconds: float
+
+
+Callback = Callable[[Progress], bool | None]
+
+
+@one_thread
+def plan(
+    problem: PlanProblem,
+    callback: Callback | None = None,
+    executor: Executor | None = None,
+    *,
+    prove: bool = False,
+) -> Plan:
+    """Find the best configurations, and a bound on how good any could be.
+
+    Args:
+        problem: What is asked.
+        callback: Told of progress; returning ``True`` cancels, the best plan so far being returned.
+        executor: Any ``concurrent.futures`` executor; the plan is the same whichever, or without one. With
+            one, time limit and cancellation act between the parts of the work.
+        prove: Make the bound rigorous (see ``prove``); the message says how close and, if not, why.
+
+    Raises:
+        InfeasibleError: Nothing satisfies the problem; names what stands in the way.
+    """
+    space = plan_space(problem)
+    clock = _Clock(problem, len(space.interest), callback)
+    *seeds, own = np.random.SeedSequence(problem.seed).spawn(len(parts(problem.starts)) + 1)
+    criterion, target = _criteria(space, np.random.default_rng(own))
+    rng = np.random.default_rng(own)
+    relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
+    proof = None
+    if prove and relaxed is not None:
+        proof_rng = np.random.default_rng(own.spawn(1)[0])
+        relaxed, proof = prove_bound(_relaxed_problem(space, target), relaxed, proof_rng, stop=clock.stop)
+    clock.tell(bound=relaxed.bound if relaxed else None)
+    if problem.candidates is not None:
+        found = _choose(space, criterion, relaxed, rng, clock)
+    else:
+        found = _search(space, criterion, relaxed, seeds, clock, executor)
+    return _assemble(space, target, relaxed, proof, found, clock)
+
+
+def worth_of(problem: PlanProblem, configurations: FloatArray) -> float:
+    """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
+    space = plan_space(problem)
+    worth = _worth(space, space.criterion(problem.criterion), configurations)
+    return reported_value(problem.criterion, worth, len(space.interest), problem.measurements)
+
+
+# ── the parts ────────────────────────────────────────────────────────────────────────────────────────
+
+
+class _Clock:
+    """Time limit, cancellation and progress in one place."""
+
+    def __init__(self, problem: PlanProblem, size: int, callback: Callback | None) -> None:
+        self.began = time.perf_counter()
+        self.deadline = self.began + problem.time_limit
+        self.callback = callback
+        self.problem, self.size = problem, size
+        self.cancelled = self.late = False
+        self.last = Progress(0, problem.starts, float("nan"), float("nan"), 0.0)
+
+    def stop(self) -> bool:
+        self.late = self.late or time.perf_counter() > self.deadline
+        self.tell()
+        return self.late or self.cancelled
+
+    def tell(self, done: int | None = None, log_worth: float | None = None, bound: float | None = None) -> None:
+        changes: dict[str, float] = {"seconds": self.seconds}
+        if done is not None:
+            changes["starts_done"] = done
+        if log_worth is not None:
+            changes["best_accuracy"] = self._value(float(np.exp(log_worth)))
+        if bound is not None:
+            changes["lower_bound"] = self._value(bound)
+        self.last = replace(self.last, **changes)  # type: ignore[arg-type]
+        if self.callback is not None and self.callback(self.last):
+            self.cancelled = True
+
+    def _value(self, worth: float) -> float:
+        return reported_value(self.problem.criterion, worth, self.size, self.problem.measurements)
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self.began
+
+
+def _criteria(space: PlanSpace, rng: np.random.Generator) -> tuple[Criterion, Criterion]:
+    """What the search maximises, and what the bound is about."""
+    problem = space.problem
+    if not problem.compound:
+        return space.search_criterion(), space.criterion(problem.criterion)
+    shares = {problem.criterion: 1.0 - sum(problem.compound.values()), **problem.compound}
+    parts = tuple(space.criterion(name) for name in shares)
+    references = tuple(_relax(space, part, rng, lambda: False).worth for part in parts)
+    made = Compound(parts, tuple(shares.values()), references)
+    return made, made
+
+
+def _relax(
+    space: PlanSpace, criterion: Criterion, rng: np.random.Generator, stop: Callable[[], bool]
+) -> RelaxedDesign:
+    tests = space.problem.test_pose_array
+    usable = tests[space.feasibility.mask(tests)] if space.problem.candidates is None else tests[:0]
+    return relaxed_design(_relaxed_problem(space, criterion), usable, rng, stop)
+
+
+def _relaxed_problem(space: PlanSpace, criterion: Criterion) -> RelaxedProblem:
+    problem = space.problem
+    return RelaxedProblem(
+        space.single,
+        criterion,
+        space.prior,
+        problem.measurements,
+        space.feasibility,
+        _pool(problem),
+        None if problem.candidates is None or problem.repeat_candidates else problem.configurations,
+    )
+
+
+def _pool(problem: PlanProblem) -> FloatArray | None:
+    return None if problem.candidates is None else np.asarray(problem.candidates)
+
+
+def _search(
+    space: PlanSpace,
+    criterion: Criterion,
+    relaxed: RelaxedDesign | None,
+    seeds: list[np.random.SeedSequence],
+    clock: _Clock,
+    executor: Executor | None,
+) -> SearchResult:
+    """Parts of the work, here or by the executor, until enough is known; the best, the first one if equal."""
+    nobody = np.empty((0, len(space.robot.joint_names)))
+    search = SearchProblem(
+        model=space.model,
+        criterion=criterion,
+        prior=space.prior,
+        size=space.problem.configurations,
+        feasibility=space.feasibility,
+        support=relaxed.support if relaxed else nobody,
+        weights=relaxed.weights if relaxed else np.empty(0),
+    )
+    sizes = parts(space.problem.starts)
+    work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
+    best: SearchResult | None = None
+    done = evaluations = 0
+    tops: list[float] = []
+    futures = [executor.submit(search_chunk, *job) for job in work] if executor else []
+    for index, job in enumerate(work):
+        if index and (clock.stop() or _agreed(tops) or _good_enough(space, relaxed, best)):
+            break
+        result = futures[index].result() if futures else search_chunk(*job, clock.stop)
+        tops.append(result.log_worth)
+        done, evaluations = done + result.starts, evaluations + result.evaluations
+        if best is None or result.log_worth > best.log_worth:
+            best = result
+        clock.tell(done, best.log_worth)
+    for future in futures:
+        future.cancel()
+    assert best is not None
+    return replace(best, starts=done, evaluations=evaluations)
+
+
+def _agreed(tops: list[float]) -> bool:
+    """Whether two parts with starts of their own ended at the same best value: more would hardly end above."""
+    best = sorted(tops)[-2:]
+    return len(best) == 2 and best[1] - best[0] < AGREEMENT
+
+
+def _good_enough(space: PlanSpace, relaxed: RelaxedDesign | None, best: SearchResult | None) -> bool:
+    """Whether the best plan is so near its bound that more starts cannot pay."""
+    if relaxed is None or best is None or space.problem.compound:
+        return False
+    worth = _worth(space, space.criterion(space.problem.criterion), best.configurations)
+    return worth >= (1.0 - GOOD_ENOUGH) * relaxed.bound
+
+
+def _choose(
+    space: PlanSpace,
+    criterion: Criterion,
+    relaxed: RelaxedDesign | None,
+    rng: np.random.Generator,
+    clock: _Clock,
+) -> SearchResult:
+    """From the candidates."""
+    problem = space.problem
+    pool = np.asarray(problem.candidates)
+    allowed = np.flatnonzero(space.feasibility.mask(pool))
+    if problem.discrepancy is not None:
+        chosen = choose_for_prediction(prediction_problem(problem, pool[allowed]), clock.stop)
+        return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
+    request = PoolProblem(
+        rows=space.model.whitened(pool[allowed]),
+        criterion=criterion,
+        prior=space.prior,
+        size=problem.configurations,
+        repeat=problem.repeat_candidates,
+        weights=relaxed.weights if relaxed else np.empty(0),
+        names=space.robot.parameter_names,
+    )
+    chosen = choose(request, rng, clock.stop)
+    clock.tell(problem.starts, chosen.log_worth)
+    return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
+
+
+# ── the answer ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def _assemble(
+    space: PlanSpace,
+    target: Criterion,
+    relaxed: RelaxedDesign | None,
+    proof: Proof | None,
+    found: SearchResult,
+    clock: _Clock,
+) -> Plan:
+    problem, robot = space.problem, space.robot
+    configurations = _rest_idle_joints(space, found.configurations)
+    configurations = configurations[visiting_order(configurations, robot)]
+    matrix = space.model.at(configurations).sum(axis=0) + space.prior
+    inverse, hidden = covariance(matrix)
+    per = np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
+    shares = problem.weight_array / max(problem.weight_array.sum(), 1e-300)
+    accuracy = float(np.sqrt(shares @ per**2)) if len(per) else float("nan")
+    plain = problem.criterion == "test_pose" and not problem.compound
+    # For the paper's criterion the worth is that of the figure reported, to the last digit.
+    worth = accuracy**-2 if plain else _worth(space, target, configurations)
+    proven = proof is not None and proof.holds
+    bound = float("nan")
+    if relaxed is not None:
+        bound = relaxed.bound if proven else max(relaxed.bound, worth)
+    name = "compound" if problem.compound else problem.criterion
+    size, n = len(space.interest), problem.measurements
+    value = worth if problem.compound else reported_value(name, worth, size, n)
+    value_bound = bound if problem.compound or not relaxed else reported_value(name, bound, size, n)
+    general = float("inf") if hidden.size else float(np.trace(space.general @ inverse))
+    status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
+    status = "singular" if hidden.size and status == "ok" else status
+    combinations = space.identifiability.combinations
+    note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}." if combinations else ""
+    if problem.discrepancy is not None:
+        note += (
+            " Chosen for a robot with systematic errors; value, bound and efficiency are for white noise alone."
+        )
+    note += f" {proof.text}" if proof else ""
+    return Plan(
+        robot=robot.name,
+        criterion=name,
+        parameters=problem.robot.parameter_names,
+        joint_names=robot.joint_names,
+        configurations=configurations,
+        repetitions=np.full(len(configurations), problem.repetitions),
+        test_poses=problem.test_pose_array,
+        weights=shares,
+        sigma=problem.instrument.typical,
+        predicted_accuracy=accuracy,
+        predicted_accuracy_per_test_pose=per,
+        parameter_std=_parameter_deviations(space, inverse, hidden),
+        unidentifiable=combinations,
+        general_accuracy=float(np.sqrt(general)),
+        value=value,
+        value_bound=value_bound,
+        lower_bound=value_bound if name in POSE_CRITERIA else float("nan"),
+        efficiency=_efficiency(name, worth, bound, value, value_bound) if relaxed else float("nan"),
+        bound="proven" if proven else "numerical" if relaxed else "none",
+        status=status,
+        message=STATUS[status] + note,
+        seconds=clock.seconds,
+        seed=problem.seed,
+        starts=found.starts,
+        evaluations=found.evaluations,
+    )
+
+
+def _rest_idle_joints(space: PlanSpace, configurations: FloatArray) -> FloatArray:
+    """Joints that change no measurement stay where the first test pose, or mid-range, has them."""
+    problem = space.problem
+    if problem.candidates is not None:
+        return configurations
+    low, high = space.robot.joint_limits.T
+    tests = problem.test_pose_array
+    rest = tests[0] if len(tests) else (low + high) / 2
+    q, other = np.random.default_rng(0).uniform(low, high, (2, 64, len(low)))
+    points, information = space.robot.positions(q), space.model.at(q)
+    rested = configurations.copy()
+    for joint in range(len(low)):
+        moved = q.copy()
+        moved[:, joint] = other[:, joint]
+        still = np.allclose(space.robot.positions(moved), points, rtol=0, atol=NO_LEVER)
+        if still and np.allclose(space.model.at(moved), information, rtol=1e-9, atol=1e-9 * information.max()):
+            rested[:, joint] = rest[joint]
+    return rested if space.feasibility.mask(rested).all() else configurations
+
+
+def _efficiency(name: str, worth: float, bound: float, value: float, value_bound: float) -> float:
+    """In the criterion's own convention; for accuracies the quotient of the two figures reported."""
+    if name in POSE_CRITERIA:
+        return value_bound / value if np.isfinite(value) else 0.0
+    return efficiency(name, worth, bound)
+
+
+def _worth(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
+    """Ψ of a plan; 0 where it is blind to what the criterion needs."""
+    matrix = space.model.at(configurations).sum(axis=0) + space.prior
+    hidden = covariance(matrix)[1]
+    return 0.0 if _blind(space, hidden) else criterion.exact(_regular(matrix, hidden))
+
+
+def _blind(space: PlanSpace, hidden: FloatArray) -> bool:
+    """Whether the criterion needs what the plan cannot see."""
+    if not hidden.size:
+        return False
+    if space.problem.criterion not in POSE_CRITERIA or space.problem.compound:
+        return True
+    tests = space.test_jacobians
+    return bool(np.abs(tests @ hidden).max() > 1e-6 * np.abs(tests).max())
+
+
+def _regular(matrix: FloatArray, hidden: FloatArray) -> FloatArray:
+    """``matrix`` made invertible where the plan is blind; what does not look there is not changed by it."""
+    return matrix + float(np.trace(matrix)) * hidden @ hidden.T if hidden.size else matrix
+
+
+def _parameter_deviations(space: PlanSpace, inverse: FloatArray, hidden: FloatArray) -> FloatArray:
+    """(P,) standard deviations: infinite where this plan is blind, NaN where every plan is."""
+    kept = sorted(space.identifiability.kept)
+    unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(kept), bool)
+    std = np.full(len(kept) + len(space.identifiability.held), np.nan)
+    std[kept] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)))
+    return std

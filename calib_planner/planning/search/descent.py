@@ -1,0 +1,279 @@
+"""Many bounded descents at once: projected BFGS with all starts in one batch.
+
+Each row of X is an independent minimisation over the same box. Coordinates that sit on a bound and would be
+pushed through it are frozen for the step (Bertsekas' ε-active set); the others follow the quasi-Newton
+direction, projected back onto the box along a backtracking Armijo search. Rows stop one by one; a row that
+has stopped costs nothing more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.planning.criteria import Criterion
+from calib_planner.planning.feasibility import Feasibility
+from calib_planner.planning.information import InformationModel
+
+Objective = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+"""Maps X (rows, D) to values (rows,) and gradients (rows, D)."""
+
+Mend = Callable[[FloatArray, FloatArray], FloatArray]
+"""Maps points before and after a step, (rows, D) each, to points after what is allowed of it."""
+
+ARMIJO = 1e-4
+HALVINGS = 12
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where the descents ended.
+
+    Attributes:
+        x: (rows, D) final points, inside the box.
+        value: (rows,) final values.
+        iterations: Iterations done by the longest row.
+        evaluations: Rows evaluated in all.
+    """
+
+    x: FloatArray
+    value: FloatArray
+    iterations: int
+    evaluations: int
+
+
+def descend(
+    objective: Objective,
+    start: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    *,
+    iterations: int = 200,
+    tolerance: float = 1e-7,
+    first_step: float = 0.2,
+    stop: Callable[[], bool] = lambda: False,
+    mend: Mend = lambda old, new: new,
+) -> Descent:
+    """Minimise ``objective`` from every row of ``start`` within [low, high].
+
+    Args:
+        objective: Value and gradient of a batch of points.
+        start: (rows, D).
+        low: (D,) lower bounds.
+        high: (D,) upper bounds.
+        iterations: Most iterations of any row.
+        tolerance: A row ends when a step lowers its value by less than this (twice in a row).
+        first_step: Length of the first step [unit of x].
+        stop: Asked before every iteration; ``True`` ends the work with what there is.
+        mend: Takes the points before and after a step, (rows, D) each, to where it may lead.
+    """
+    x = np.clip(start, low, high)
+    value, gradient = objective(x)
+    rows, size = x.shape
+    inverse = np.broadcast_to(np.eye(size), (rows, size, size)).copy()
+    fresh = np.ones(rows, bool)
+    idle = np.zeros(rows, int)
+    live = np.flatnonzero(np.isfinite(value))
+    evaluations, done = rows, 0
+    while live.size and done < iterations and not stop():
+        done += 1
+        g = gradient[live]
+        direction = _direction(x[live], g, inverse[live], low, high)
+        norm = np.linalg.norm(direction, axis=1)
+        scale = np.where(fresh[live], first_step / np.maximum(norm, 1e-300), 1.0)
+        scale = np.minimum(scale, 2.0 / np.maximum(norm, 1e-300))
+        new_x, new_value, new_gradient, used = _line_search(
+            objective, x[live], value[live], g, direction, scale, low, high, mend
+        )
+        evaluations += used
+        drop = value[live] - new_value
+        moved = drop > 0
+        step, change = new_x - x[live], new_gradient - g
+        _update(inverse, fresh, live[moved], step[moved], change[moved])
+        # A failed search restarts from steepest descent once before the row is given up.
+        lost = live[~moved & ~fresh[live]]
+        inverse[lost] = np.eye(size)
+        over = ~moved & fresh[live]
+        fresh[lost] = True
+        x[live[moved]] = new_x[moved]
+        gradient[live[moved]] = new_gradient[moved]
+        value[live[moved]] = new_value[moved]
+        idle[live] = np.where(moved & (drop > tolerance), 0, idle[live] + 1)
+        live = live[~over & (idle[live] < 2)]
+    return Descent(x, value, done, evaluations)
+
+
+def _direction(
+    x: FloatArray, g: FloatArray, inverse: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    margin = 1e-9
+    held = ((x <= low + margin) & (g > 0)) | ((x >= high - margin) & (g < 0))
+    free_g = np.where(held, 0.0, g)
+    direction = -np.matmul(inverse, free_g[:, :, None])[:, :, 0]
+    direction[held] = 0.0
+    uphill = (direction * g).sum(axis=1) >= 0
+    direction[uphill] = -free_g[uphill]
+    return direction
+
+
+def _line_search(
+    objective: Objective,
+    x: FloatArray,
+    value: FloatArray,
+    g: FloatArray,
+    direction: FloatArray,
+    scale: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    mend: Mend,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    best_x, best_value, best_g = x.copy(), value.copy(), g.copy()
+    open_rows = np.arange(len(x))
+    used = 0
+    for _ in range(HALVINGS):
+        trial = np.clip(x[open_rows] + scale[open_rows, None] * direction[open_rows], low, high)
+        trial = mend(x[open_rows], trial)
+        f, df = objective(trial)
+        used += len(open_rows)
+        slope = (g[open_rows] * (trial - x[open_rows])).sum(axis=1)
+        good = np.isfinite(f) & (f <= value[open_rows] + ARMIJO * slope) & (f < value[open_rows])
+        hit = open_rows[good]
+        best_x[hit], best_value[hit], best_g[hit] = trial[good], f[good], df[good]
+        open_rows = open_rows[~good]
+        if not open_rows.size:
+            break
+        scale[open_rows] *= 0.35
+    return best_x, best_value, best_g, used
+
+
+def _update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray) -> None:
+    """BFGS update of the inverse Hessians of ``rows``, scaled at first use, skipped where s·y ≤ 0."""
+    sy = (s * y).sum(axis=1)
+    good = sy > 1e-10 * np.linalg.norm(s, axis=1) * np.linalg.norm(y, axis=1)
+    rows, s, y, sy = rows[good], s[good], y[good], sy[good]
+    if not rows.size:
+        return
+    h = inverse[rows]
+    first = fresh[rows]
+    h[first] *= (sy[first] / (y[first] ** 2).sum(axis=1))[:, None, None]
+    hy = np.matmul(h, y[:, :, None])[:, :, 0]
+    rho = 1.0 / sy
+    weight = rho * (1.0 + rho * (y * hy).sum(axis=1))
+    cross = (rho[:, None] * hy)[:, :, None] * s[:, None, :]
+    h -= cross
+    h -= cross.transpose(0, 2, 1)
+    h += (weight[:, None] * s)[:, :, None] * s[:, None, :]
+    inverse[rows] = h
+    fresh[rows] = False
+
+
+# ── Improving by feasible random steps: what gradients cannot do along the edge of what is allowed ──────────
+# A descent that may not leave the allowed set stops where its direction points outside, although it could slide
+# along the edge. Here every configuration gets trial steps of many lengths, in all joints or in one or two; the
+# infeasible ones are dropped, the best of the others is taken if it improves the worth. Inside, that is slower
+# than gradients, but it asks nothing of the constraints except yes or no.
+
+TRIALS = 48
+"""Trial steps of every configuration in a sweep."""
+LONGEST, SHORTEST = 0.5, 5e-4
+"""Lengths of steps, drawn evenly in the logarithm, as shares of the joint ranges."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wandered:
+    """Configurations (size, joints) after the steps, the log of their worth, worths computed."""
+
+    configurations: FloatArray
+    log_worth: float
+    evaluations: int
+
+
+def feasible_steps(
+    feasibility: Feasibility, q: FloatArray, rng: np.random.Generator, trials: int = TRIALS
+) -> tuple[FloatArray, IntArray]:
+    """Random feasible steps from every row of ``q`` (N, joints).
+
+    Returns:
+        (K, joints) configurations, K ≤ N·trials, and (K,) the row of ``q`` each one started from.
+    """
+    low, high = feasibility.limits.T
+    n, joints = q.shape
+    length = np.exp(rng.uniform(np.log(SHORTEST), np.log(LONGEST), (n, trials, 1)))
+    step = length * rng.normal(size=(n, trials, joints))
+    few = rng.random((n, trials, joints)) < 1.5 / joints
+    step[:, ::2] *= few[:, ::2]
+    moved = np.clip(q[:, None] + step * (high - low), low, high).reshape(-1, joints)
+    good = np.flatnonzero(feasibility.mask(moved))
+    return moved[good], np.asarray(good // trials, np.int64)
+
+
+def wander(
+    model: InformationModel,
+    criterion: Criterion,
+    prior: FloatArray,
+    feasibility: Feasibility,
+    start: FloatArray,
+    rng: np.random.Generator,
+    stop: Callable[[], bool] = lambda: False,
+    *,
+    sweeps: int = 40,
+    gain: float = 2e-4,
+) -> Wandered:
+    """Improve the plan ``start`` (size, joints); ends when five sweeps gain less than ``gain`` in log worth."""
+    q = start.copy()
+    unit = model.at(q)
+    matrix = unit.sum(axis=0) + prior
+    log_worth = _log_worths(criterion, matrix[None])[0]
+    marks, evaluations = [log_worth], 0
+    for _ in range(sweeps):
+        if stop() or (len(marks) > 5 and marks[-1] - marks[-6] < gain):
+            break
+        trial, origin = feasible_steps(feasibility, q, rng)
+        trial_unit = model.at(trial)
+        for row in range(len(q)):
+            mine = np.flatnonzero(origin == row)
+            if not mine.size:
+                continue
+            worths = _log_worths(criterion, matrix - unit[row] + trial_unit[mine])
+            evaluations += len(mine)
+            best = int(np.argmax(worths))
+            if worths[best] > log_worth:
+                log_worth, chosen = worths[best], mine[best]
+                matrix = matrix - unit[row] + trial_unit[chosen]
+                q[row], unit[row] = trial[chosen], trial_unit[chosen]
+        matrix = unit.sum(axis=0) + prior
+        marks.append(log_worth)
+    return Wandered(q, float(log_worth), evaluations)
+
+
+def climb(
+    feasibility: Feasibility,
+    height: Callable[[FloatArray], FloatArray],
+    start: FloatArray,
+    rng: np.random.Generator,
+    *,
+    rounds: int = 30,
+) -> tuple[FloatArray, FloatArray]:
+    """Raise ``height`` (N, joints) → (N,) from every row of ``start`` by feasible steps; rows and heights."""
+    q, best = start.copy(), height(start)
+    for _ in range(rounds):
+        trial, origin = feasible_steps(feasibility, q, rng, 24)
+        if not len(trial):
+            continue
+        values = height(trial)
+        order = np.argsort(values)  # the last write to a row is its highest
+        higher = order[values[order] > best[origin[order]]]
+        q[origin[higher]], best[origin[higher]] = trial[higher], values[higher]
+    return q, best
+
+
+def _log_worths(criterion: Criterion, matrices: FloatArray) -> FloatArray:
+    diagonal = np.einsum("spp->sp", matrices)
+    floor = 1e-12 * diagonal.mean(axis=1)[:, None, None] * np.eye(matrices.shape[-1])
+    worth = criterion.worth_and_slope(matrices + floor)[0]
+    usable = np.isfinite(worth) & (worth > 0)
+    return np.where(usable, np.log(np.where(usable, worth, 1.0)), -np.inf)

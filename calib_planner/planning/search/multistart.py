@@ -1,0 +1,220 @@
+"""The best plan over continuous configurations: many descents of −log Ψ from seeded starts.
+
+Gradient. For a plan with M = M_0 + Σ I(q_i), the slope G = ∂Ψ/∂M turns into ∂Ψ/∂q_i by
+``LinearisedInformation.gradient``: the whole gradient costs about as much as the value.
+
+Starts. A third draws configurations from the relaxed optimum (see ``bound``) in proportion to its weights —
+rounding it, which the descent then repairs; a third repeats a good small plan, because eq. (20) and the paper's
+Table 2 show that good plans are a few good configurations repeated; the rest is random.
+
+Feasibility. Every start is feasible, and of every step only those configurations move that stay so: what comes
+out is feasible by construction. Steps do not follow the edge of the allowed set, so with constraints the best
+plan of each part is then improved by random feasible steps (see ``wander``) and descents in turn.
+
+Work is cut into independent ``parts`` with their own seeds, whatever executes them: same seed, same plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib_planner.arrays import FloatArray
+from calib_planner.planning.criteria import Criterion
+from calib_planner.planning.feasibility import Feasibility
+from calib_planner.planning.information import InformationModel
+from calib_planner.planning.search.descent import Descent, Mend, Objective, descend, wander
+
+RIDGE = 1e-12
+"""Added to the information of a plan, relative to its diagonal, so that singular plans stay finite."""
+CHUNKS, LARGEST = 4, 32
+"""Fewest parts of the work, and most starts in one."""
+FINALISTS = 3
+"""Plans of each chunk that are polished to the end."""
+BATCH = 4_000_000
+"""Numbers in the inverse Hessians of descents side by side: beyond that, moving them through memory takes longer
+than the work on them, and a large plan would not notice for seconds that it was cancelled."""
+EDGE_ROUNDS = 4
+"""Turns of random steps and descent that a constrained plan gets at most."""
+
+
+def parts(starts: int) -> tuple[int, ...]:
+    """Starts in each independent part of the work."""
+    count = max(CHUNKS, -(-starts // LARGEST))
+    return tuple(starts // count + (k < starts % count) for k in range(count))
+
+
+@dataclass(frozen=True, eq=False)
+class SearchProblem:
+    """Choose ``size`` configurations.
+
+    Attributes:
+        model: Information of one configuration.
+        criterion: Its worth is maximised.
+        prior: (p, p) M_0.
+        size: Number of configurations.
+        feasibility: What they have to obey besides the joint limits.
+        support: (K, joints) configurations of the relaxed optimum; K may be 0.
+        weights: (K,) their weights.
+    """
+
+    model: InformationModel
+    criterion: Criterion
+    prior: FloatArray
+    size: int
+    feasibility: Feasibility
+    support: FloatArray
+    weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Best configurations (size, joints), the log of their worth, and the work it took."""
+
+    configurations: FloatArray
+    log_worth: float
+    starts: int
+    evaluations: int
+
+
+def plan_objective(problem: SearchProblem, size: int) -> Objective:
+    """−log Ψ and gradient of plans given as rows of ``size``·joints coordinates."""
+
+    def objective(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        q = rows.reshape(len(rows) * size, -1)
+        info = problem.model.linearised(q)
+        matrix = info.sums(size) + problem.prior
+        diagonal = np.einsum("spp->sp", matrix)
+        diagonal += RIDGE * diagonal.mean(axis=1, keepdims=True)
+        worth, slope = problem.criterion.worth_and_slope(matrix)
+        usable = worth > 0
+        safe = np.where(usable, worth, 1.0)
+        gradient = info.gradient(-slope / safe[:, None, None])
+        return np.where(usable, -np.log(safe), np.inf), gradient.reshape(len(rows), -1)
+
+    return objective
+
+
+def search_chunk(
+    problem: SearchProblem,
+    starts: int,
+    rng: np.random.Generator,
+    stop: Callable[[], bool] = lambda: False,
+) -> SearchResult:
+    """One part of the work: ``starts`` descents, the best of them."""
+    size = problem.size
+    rows, used = _starts(problem, starts, rng, stop)
+    rough = _descend_from(problem, size, rows, stop, 80, 1e-4)
+    finalists = rough.x[np.argsort(rough.value)[:FINALISTS]]
+    final = _descend_from(problem, size, finalists, stop, 200, 1e-7)
+    work = used + rough.evaluations + final.evaluations
+    if problem.feasibility.constraints:
+        final, more = _along_the_edge(problem, final, rng, stop)
+        work += more
+    best = int(np.argmin(final.value))
+    configurations = final.x[best].reshape(size, -1)
+    return SearchResult(configurations, -float(final.value[best]), starts, work)
+
+
+def _along_the_edge(
+    problem: SearchProblem, final: Descent, rng: np.random.Generator, stop: Callable[[], bool]
+) -> tuple[Descent, int]:
+    """Improve the best plan by random feasible steps and descents in turn, while that pays."""
+    size, best = problem.size, int(np.argmin(final.value))
+    row, value, work = final.x[best], float(final.value[best]), 0
+    for _ in range(EDGE_ROUNDS):
+        plan = row.reshape(size, -1)
+        moved = wander(problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, stop)
+        descended = _descend_from(problem, size, moved.configurations[None], stop, 60, 1e-6)
+        work += moved.evaluations + descended.evaluations
+        gained = value - float(descended.value[0])
+        if gained > 0:
+            row, value = descended.x[0], float(descended.value[0])
+        if gained < 1e-3 or stop():
+            break
+    return Descent(row[None], np.array([value]), final.iterations, work), work
+
+
+def _starts(
+    problem: SearchProblem, starts: int, rng: np.random.Generator, stop: Callable[[], bool]
+) -> tuple[FloatArray, int]:
+    """(rows, size, joints) starting plans, and plans evaluated on the way."""
+    size, draw = problem.size, problem.feasibility.sample
+    parts, evaluations = [], 0
+    rounded = -(-starts // 3) if len(problem.support) else 0
+    if rounded:
+        picks = rng.choice(len(problem.support), (rounded, size), p=problem.weights)
+        parts.append(_shake(problem, problem.support[picks], rng))
+    kernel_size = _smallest(problem)
+    tiled = -(-starts // 3) if kernel_size < size else 0
+    if tiled:
+        first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
+        kernel = _descend_from(problem, kernel_size, first, stop, 80, 1e-4)
+        evaluations += kernel.evaluations
+        best = np.argsort(kernel.value)[: max(2, tiled // 4)]
+        rows = np.resize(np.arange(kernel_size), size)
+        parts.append(_shake(problem, kernel.x[best].reshape(len(best), kernel_size, -1)[:, rows], rng))
+    random = max(starts - rounded - tiled, 1)
+    parts.append(draw(rng, random * size).reshape(random, size, -1))
+    return np.concatenate(parts), evaluations
+
+
+def _smallest(problem: SearchProblem) -> int:
+    """Configurations needed to identify everything without a prior."""
+    robot = problem.model.robot
+    return max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
+
+
+def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Move copies apart a little, where that is feasible."""
+    low, high = problem.model.robot.joint_limits.T
+    moved = np.clip(plans + rng.normal(0.0, 0.02, plans.shape), low, high)
+    ok = problem.feasibility.mask(moved.reshape(-1, len(low))).reshape(plans.shape[:2])
+    return np.where(ok[:, :, None], moved, plans)
+
+
+def _descend_from(
+    problem: SearchProblem,
+    size: int,
+    rows: FloatArray,
+    stop: Callable[[], bool],
+    iterations: int,
+    tolerance: float,
+) -> Descent:
+    low, high = problem.model.robot.joint_limits.T
+    flat = rows.reshape(len(rows), -1)
+    beside = max(BATCH // flat.shape[1] ** 2, 1)
+    ended = [
+        descend(
+            plan_objective(problem, size),
+            flat[first : first + beside],
+            np.tile(low, size),
+            np.tile(high, size),
+            iterations=iterations,
+            tolerance=tolerance,
+            stop=stop,
+            mend=_mend(problem.feasibility, size),
+        )
+        for first in range(0, len(flat), beside)
+    ]
+    return Descent(
+        np.concatenate([part.x for part in ended]),
+        np.concatenate([part.value for part in ended]),
+        max(part.iterations for part in ended),
+        sum(part.evaluations for part in ended),
+    )
+
+
+def _mend(feasibility: Feasibility, size: int) -> Mend:
+    """Of a step of a plan, what is feasible: a configuration that would leave the allowed set stays."""
+
+    def mend(old: FloatArray, new: FloatArray) -> FloatArray:
+        if not feasibility.constraints:
+            return new
+        rows = (len(new), size, -1)
+        ok = feasibility.mask(new.reshape(len(new) * size, -1)).reshape(len(new), size, 1)
+        return np.where(ok, new.reshape(rows), old.reshape(rows)).reshape(new.shape)
+
+    return mend

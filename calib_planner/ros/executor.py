@@ -1,0 +1,152 @@
+"""Which plans a robot can execute: the same for the simulated one and for the adapter of a real one."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from action_msgs.srv import CancelGoal
+from calib_planner_msgs.action import ExecutePlan
+from rclpy.action import ActionClient
+from unique_identifier_msgs.msg import UUID
+
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.units import cut
+
+MOST_STANDSTILLS = 100_000
+"""Standstills of one plan; at a second each that is more than a day."""
+
+
+def check_executable(plan: Plan, robot: Robot) -> None:
+    """Refuse a plan that this robot cannot execute.
+
+    Raises:
+        InputError: Other robot or joints, a configuration outside the limits, or standstills without end.
+    """
+    if plan.robot != robot.name:
+        raise UnknownNameError("plan.robot", plan.robot, [robot.name])
+    if plan.joint_names != robot.joint_names:
+        raise InputError("plan.joint_names", ", ".join(plan.joint_names), ", ".join(robot.joint_names))
+    if plan.measurements > MOST_STANDSTILLS:
+        expected = f"at most {MOST_STANDSTILLS}"
+        raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
+    low, high = robot.joint_limits.T
+    outside = (plan.configurations < low - 1e-6) | (plan.configurations > high + 1e-6)
+    if outside.any():
+        i, j = (int(k) for k in np.argwhere(outside)[0])
+        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
+        raise InputError(f"plan.configurations, row {i}", f"{plan.configurations[i, j]:.4f}", expected)
+
+
+# ── One ``ExecutePlan`` goal at a time, with an end whatever the robot's side does ──────────────────────────
+# A goal ends with the robot's result, or *lost*: nothing was heard of it (no answer, no feedback) for ``silence``
+# seconds. What is lost may be running all the same; it is cancelled under the name that we gave it, as soon as
+# anybody listens. Everything here is called in the thread of the executor.
+
+RESULTS = {
+    ExecutePlan.Result.SUCCESS: "done",
+    ExecutePlan.Result.INVALID_PLAN: "refused",
+    ExecutePlan.Result.CANCELLED: "cancelled",
+    ExecutePlan.Result.ABORTED: "aborted",
+    ExecutePlan.Result.BUSY: "busy",
+}
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a goal ended: a value of ``RESULTS`` (``busy`` also if it was not accepted) or ``lost``; and why."""
+
+    how: str
+    message: str
+
+
+class PlanExecution:
+    """See the module; made in ``configure`` of ``node``."""
+
+    def __init__(self, node: ManagedNode[Any], action: str) -> None:
+        self._client = ActionClient(node, ExecutePlan, action)
+        node.undo_with(self._client.destroy)
+        self._canceller = node.create_client(CancelGoal, f"{action}/_action/cancel_goal")
+        self.action = action
+        self._goal: UUID | None = None
+        self._ended: Ended | None = None
+        self._heard = 0.0
+        self._begun = self._cancelling = False
+
+    @property
+    def ready(self) -> bool:
+        """Whether somebody offers the action."""
+        return bool(self._client.server_is_ready())
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is under way."""
+        return self._goal is not None
+
+    @property
+    def begun(self) -> bool:
+        """Whether the robot has told how far it is; to accept a goal is not to do it."""
+        return self._begun
+
+    def send(self, goal: ExecutePlan.Goal) -> None:
+        """Begin; the one before must have ended."""
+        name = UUID(uuid=list(uuid.uuid4().bytes))
+        self._goal, self._ended, self._begun, self._cancelling = name, None, False, False
+        self._heard = time.monotonic()
+        sent = self._client.send_goal_async(goal, lambda _: self._alive(name, begun=True), goal_uuid=name)
+        sent.add_done_callback(lambda future: self._answered(name, future))
+
+    def cancel(self) -> None:
+        """Ask for an early end, once; it is heard of by ``poll``."""
+        if self._goal is None or self._cancelling:
+            return
+        self._cancelling = True
+        self._heard = time.monotonic()
+        self._cancel(self._goal)
+
+    def poll(self, silence: float) -> Ended | None:
+        """How the goal ended, told once; ``None`` while it runs."""
+        if self._goal is not None and self._ended is None and time.monotonic() - self._heard > silence:
+            self._cancel(self._goal)
+            self._ended = Ended("lost", f"nothing heard from {self.action} for {silence:g} s")
+        ended = self._ended
+        if ended is not None:
+            self._goal = self._ended = None
+        return ended
+
+    def _alive(self, name: UUID, begun: bool = False) -> None:
+        if name is self._goal:
+            self._heard = time.monotonic()
+            self._begun |= begun
+
+    def _answered(self, name: UUID, future: Any) -> None:
+        if name is not self._goal:
+            return
+        self._alive(name)
+        handle = future.result() if future.exception() is None else None
+        if handle is None or not handle.accepted:
+            self._ended = Ended("busy", f"{self.action} did not accept the goal")
+            return
+        handle.get_result_async().add_done_callback(lambda result: self._finished(name, result))
+
+    def _finished(self, name: UUID, future: Any) -> None:
+        if name is not self._goal or self._ended is not None:
+            return
+        if future.exception() is not None:
+            self._ended = Ended("lost", f"no result from {self.action}")
+            return
+        result = future.result().result
+        how = RESULTS.get(result.status, "aborted")
+        self._ended = Ended(how, cut(result.message, 500))
+
+    def _cancel(self, name: UUID) -> None:
+        request = CancelGoal.Request()
+        request.goal_info.goal_id = name
+        if self._canceller.service_is_ready():
+            self._canceller.call_async(request)

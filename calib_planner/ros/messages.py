@@ -1,0 +1,365 @@
+"""Messages to library values and back; nothing here needs a node or spins.
+
+What comes from the wire is checked here and nowhere else: lengths, finiteness, sizes. What does not fit
+raises the library's own errors, with the message's field in ``InputError.field``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import Plan as PlanMessage
+from geometry_msgs.msg import Point, PointStamped, Vector3
+from numpy.typing import ArrayLike
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from calib_planner.acquisition import NANO, Reason, Rejection, Standstill, pick_joints
+from calib_planner.arrays import FloatArray, check_array, check_number
+from calib_planner.errors import InputError
+from calib_planner.planning import Pace, Plan, timetable
+from calib_planner.robot import Robot
+from calib_planner.units import brief
+
+MOST_ROWS = 10_000
+"""Largest number of configurations or test poses taken from a message."""
+MOST_REPETITIONS = 100_000
+
+PLAN_STATUS = {
+    "ok": PlanMessage.STATUS_OK,
+    "not_converged": PlanMessage.STATUS_NOT_CONVERGED,
+    "time_limit": PlanMessage.STATUS_TIME_LIMIT,
+    "cancelled": PlanMessage.STATUS_CANCELLED,
+    "singular": PlanMessage.STATUS_SINGULAR,
+    "infeasible": PlanMessage.STATUS_INFEASIBLE,
+    "empty": PlanMessage.STATUS_EMPTY,
+}
+ESTIMATE_STATUS = {
+    "ok": CalibrationEstimate.STATUS_OK,
+    "too_few": CalibrationEstimate.STATUS_TOO_FEW_MEASUREMENTS,
+    "rank_deficient": CalibrationEstimate.STATUS_RANK_DEFICIENT,
+    "not_converged": CalibrationEstimate.STATUS_NOT_CONVERGED,
+    "poor_fit": CalibrationEstimate.STATUS_POOR_FIT,
+    "error": CalibrationEstimate.STATUS_ERROR,
+}
+MEASUREMENT_STATUS = {
+    "accepted": Measurement.ACCEPTED,
+    Reason.MOVED.value: Measurement.REJECTED_MOVED,
+    Reason.TOO_FEW_SAMPLES.value: Measurement.REJECTED_TOO_FEW_SAMPLES,
+    Reason.TIME_SKEW.value: Measurement.REJECTED_TIME_SKEW,
+    Reason.OTHER_FRAME.value: Measurement.REJECTED_OTHER_FRAME,
+    Reason.NOT_FINITE.value: Measurement.REJECTED_NOT_FINITE,
+    "not_in_plan": Measurement.REJECTED_NOT_IN_PLAN,
+    "outlier": Measurement.REJECTED_OUTLIER,
+    "bad_joints": Measurement.REJECTED_BAD_JOINTS,
+    "undone": Measurement.REJECTED_UNDONE,
+    "not_stored": Measurement.REJECTED_NOT_STORED,
+    "clock_offset": Measurement.REJECTED_CLOCK_OFFSET,
+}
+
+
+def nanoseconds(stamp: Time) -> int:
+    """A stamp [ns]."""
+    return int(stamp.sec) * NANO + int(stamp.nanosec)
+
+
+def stamp_message(stamp: int) -> Time:
+    """A stamp [ns] as message; outside what fits into one, the nearest that does."""
+    stamp = min(max(stamp, 0), (2**31 - 1) * NANO)
+    return Time(sec=stamp // NANO, nanosec=stamp % NANO)
+
+
+# ── plans ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, eq=False)
+class ReceivedPlan:
+    """A plan as it came over the wire: what is needed to execute it and to compare with it.
+
+    Attributes:
+        plan_id: Its name.
+        plan: The plan; what no message carries (weights, predicted standard deviations, counts) is NaN or 0.
+    """
+
+    plan_id: str
+    plan: Plan
+
+
+def plan_to_message(plan: Plan, plan_id: str, stamp: int, frame_id: str) -> PlanMessage:
+    """A plan as message, made at ``stamp`` [ns]."""
+    message = PlanMessage(
+        plan_id=plan_id,
+        robot=plan.robot,
+        criterion=plan.criterion,
+        parameters=list(plan.parameters),
+        joint_names=list(plan.joint_names),
+        configurations=plan.configurations.ravel().tolist(),
+        repetitions=plan.repetitions.tolist(),
+        test_poses=plan.test_poses.ravel().tolist(),
+        sigma=float(plan.sigma),
+        predicted_accuracy=float(plan.predicted_accuracy),
+        predicted_accuracy_per_test_pose=plan.predicted_accuracy_per_test_pose.tolist(),
+        lower_bound=float(plan.lower_bound),
+        efficiency=float(plan.efficiency),
+        bound=plan.bound,
+        seed=int(plan.seed) % 2**32,
+        seconds=float(plan.seconds),
+        status=PLAN_STATUS[plan.status],
+        message=plan.message,
+    )
+    message.header.stamp = stamp_message(stamp)
+    message.header.frame_id = frame_id
+    return message
+
+
+def plan_from_message(message: PlanMessage) -> ReceivedPlan:
+    """Check a plan from the wire.
+
+    Raises:
+        InputError: A length that does not fit, a number that is not finite, an unusable status.
+    """
+    joints = tuple(message.joint_names)
+    if not joints or len(set(joints)) != len(joints):
+        raise InputError("joint_names", brief(list(joints)), "at least one name, each once")
+    q = check_rows("configurations", message.configurations, joints)
+    poses = check_rows("test_poses", message.test_poses, joints, least=0)
+    counts = np.asarray(message.repetitions, np.int64)
+    if counts.shape != (len(q),) or (counts < 1).any() or (counts > MOST_REPETITIONS).any():
+        expected = f"{len(q)} numbers from 1 to {MOST_REPETITIONS}, one per configuration"
+        raise InputError("repetitions", brief(counts.tolist()), expected)
+    names = {v: k for k, v in PLAN_STATUS.items()}
+    status = names.get(message.status, "")
+    if status in ("", "empty", "infeasible"):
+        raise InputError("status", status or message.status, "a plan that can be executed")
+    accuracy = np.asarray(message.predicted_accuracy_per_test_pose, float)
+    if accuracy.shape != (len(poses),):
+        expected = f"{len(poses)} numbers, one per test pose"
+        raise InputError("predicted_accuracy_per_test_pose", accuracy.shape, expected)
+    plan = Plan(
+        robot=message.robot,
+        criterion=message.criterion,
+        parameters=tuple(message.parameters),
+        joint_names=joints,
+        configurations=q,
+        repetitions=counts,
+        test_poses=poses,
+        weights=np.full(len(poses), np.nan),
+        sigma=check_number("sigma", message.sigma, low=0, high=1, unit="m"),
+        predicted_accuracy=float(message.predicted_accuracy),
+        predicted_accuracy_per_test_pose=accuracy,
+        parameter_std=np.full(len(message.parameters), np.nan),
+        unidentifiable=(),
+        general_accuracy=float("nan"),
+        value=float(message.predicted_accuracy),
+        value_bound=float(message.lower_bound),
+        lower_bound=float(message.lower_bound),
+        efficiency=float(message.efficiency),
+        bound=message.bound,
+        status=status,
+        message=message.message,
+        seconds=float(message.seconds),
+        seed=int(message.seed),
+        starts=0,
+        evaluations=0,
+    )
+    return ReceivedPlan(message.plan_id, plan)
+
+
+def check_rows(field: str, flat: ArrayLike, joints: Sequence[str], least: int = 1) -> FloatArray:
+    """(rows, joints) [rad | m] from a row-major list of finite numbers.
+
+    Raises:
+        InputError: The length is no multiple of the number of joints, or too large, or a number not finite.
+    """
+    values = np.asarray(flat, dtype=float).ravel()
+    n = len(joints)
+    if values.size % n or not least * n <= values.size <= MOST_ROWS * n:
+        expected = f"rows of {n} numbers, joints in the order {', '.join(joints)}, {least} to {MOST_ROWS} rows"
+        raise InputError(field, f"{values.size} numbers", expected)
+    rows = values.reshape(-1, n)
+    return check_array(field, rows, (None, n), meaning="joints in rad or m")
+
+
+# ── measuring ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def joints_from_message(message: JointState, joint_names: Sequence[str]) -> FloatArray:
+    """Positions (joints,) [rad | m] in the order wanted; other joints are ignored, values may be NaN.
+
+    Raises:
+        UnknownNameError: A joint is missing.
+        InputError: A name is there twice, or names and positions differ in number.
+    """
+    return pick_joints(message.name, message.position, joint_names)
+
+
+def joints_message(names: Sequence[str], positions: FloatArray, stamp: int) -> JointState:
+    """Positions (joints,) [rad | m] at ``stamp`` [ns]."""
+    message = JointState(name=list(names), position=positions.tolist())
+    message.header.stamp = stamp_message(stamp)
+    return message
+
+
+def point_from_message(message: PointStamped) -> FloatArray:
+    """Point (3,) [m] in the tracker's frame; NaN where not seen."""
+    return np.array([message.point.x, message.point.y, message.point.z])
+
+
+def point_message(xyz: FloatArray, stamp: int, frame_id: str) -> PointStamped:
+    """Point (3,) [m] at ``stamp`` [ns]."""
+    message = PointStamped(point=Point(**_xyz(xyz)))
+    message.header.stamp, message.header.frame_id = stamp_message(stamp), frame_id
+    return message
+
+
+def measurement_message(
+    found: Standstill | Rejection,
+    joint_names: Sequence[str],
+    frame_id: str,
+    *,
+    status: str = "accepted",
+    reason: str = "",
+    plan_id: str = "",
+    index: int | None = None,
+    repetition: int = 0,
+    number: int = 0,
+    unused: Sequence[int] = (),
+) -> Measurement:
+    """What became of a standstill; ``status`` is a key of ``MEASUREMENT_STATUS``."""
+    message = Measurement(
+        id=number,
+        plan_id=plan_id,
+        configuration_index=Measurement.UNPLANNED if index is None else index,
+        repetition=repetition,
+        joint_names=list(joint_names),
+        joint_positions=found.joints.tolist(),
+        samples=found.samples.tolist(),
+        duration=(found.stop - found.start) / NANO,
+        status=MEASUREMENT_STATUS[status],
+        unused_targets=list(unused),
+        reason=reason,
+    )
+    message.header.stamp = stamp_message((found.start + found.stop) // 2)
+    message.header.frame_id = frame_id
+    if isinstance(found, Standstill):
+        message.points = [Point(**_xyz(p)) for p in found.points]
+        message.std = [Vector3(**_xyz(np.full(3, s))) for s in found.std]
+    return message
+
+
+def _xyz(values: FloatArray) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+# ── estimates ────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, eq=False)
+class ReceivedEstimate:
+    """The part of an estimate that travels, as arrays; see ``CalibrationEstimate``.
+
+    Attributes:
+        parameters: P names.
+        nominal, deviations, std: (P,) [m | rad].
+        predicted_accuracy: (t,) ρ0 at the test poses [m].
+        sigma: Standard deviation of one coordinate [m].
+        sigma_estimate: The same from the residuals [m].
+    """
+
+    parameters: tuple[str, ...]
+    nominal: FloatArray
+    deviations: FloatArray
+    std: FloatArray
+    predicted_accuracy: FloatArray
+    sigma: float
+    sigma_estimate: float
+
+
+def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
+    """An ``Estimate`` as message; ``others`` sets further fields (``plan_id``, ``condition``, …)."""
+    numbers = {
+        "nominal": estimate.nominal,
+        "value": estimate.values,
+        "deviation": estimate.deviations,
+        "std": estimate.std,
+        "covariance": estimate.covariance,
+        "test_poses": estimate.test_poses,
+        "predicted_accuracy": estimate.predicted_accuracy_per_test_pose,
+    }
+    fields: dict[str, Any] = {k: np.asarray(v, float).ravel().tolist() for k, v in numbers.items()}
+    fields |= {
+        "robot": estimate.robot,
+        "parameters": list(estimate.parameters),
+        "units": list(estimate.units),
+        "rank": estimate.rank,
+        "unidentifiable": list(estimate.unidentifiable),
+        "measurements": estimate.used,
+        "sigma": float(estimate.sigma),
+        "sigma_estimate": float(estimate.sigma_estimate),
+        "residual_rms_before": float(estimate.residual_before.rms),
+        "residual_rms_after": float(estimate.residual_after.rms),
+        "status": ESTIMATE_STATUS.get(estimate.status, CalibrationEstimate.STATUS_ERROR),
+        "message": estimate.message,
+        "condition": float("nan"),
+        "outliers": len(estimate.rejected),
+        "verdict": estimate.verdict.level,
+        "reasons": [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in estimate.verdict.reasons],
+    }
+    return CalibrationEstimate(**(fields | others))
+
+
+def estimate_from_message(message: CalibrationEstimate) -> ReceivedEstimate:
+    """Check an estimate from the wire.
+
+    Raises:
+        InputError: Lengths differ, or a value is not finite.
+    """
+    names = tuple(message.parameters)
+    nominal = check_array("nominal", message.nominal, (len(names),))
+    deviation = check_array("deviation", message.deviation, (len(names),))
+    std = check_array("std", message.std, (len(names),), finite=False)
+    accuracy = check_array("predicted_accuracy", message.predicted_accuracy, (None,), finite=False)
+    sigma = float(message.sigma)
+    return ReceivedEstimate(names, nominal, deviation, std, accuracy, sigma, float(message.sigma_estimate))
+
+
+# ── A plan as a trajectory for a controller: slow enough, also on the unknown way to its first stop ─────────
+
+
+def pace_of(robot: Robot, turning: float, sliding: float, limits: FloatArray, dwell: float) -> Pace:
+    """Joint speeds: ``turning`` [rad/s] or ``sliding`` [m/s], and never above ``limits`` (joints,)."""
+    wanted = np.where(robot.joint_is_revolute, turning, sliding)
+    return Pace(np.minimum(wanted, limits), dwell, "of the node's parameters and the robot description")
+
+
+def trajectory_message(plan: Plan, robot: Robot, pace: Pace, stamp: int, frame_id: str) -> JointTrajectory:
+    """Arrival at and departure from every stop, at rest; only the arrival if nobody stands there.
+
+    Args:
+        plan: Its configurations [rad | m], in the order of visiting.
+        robot: Its limits bound the way to the first stop, which begins nobody knows where.
+        pace: Speeds and standstill.
+        stamp: Of the header [ns].
+        frame_id: Of the header.
+
+    Raises:
+        InputError: The tour is longer than a ROS duration can say.
+    """
+    times = timetable(plan, robot, pace)
+    result = JointTrajectory(joint_names=list(plan.joint_names))
+    result.header.stamp, result.header.frame_id = stamp_message(stamp), frame_id
+    for q, arrive, leave in zip(plan.configurations.tolist(), times.arrive, times.leave, strict=True):
+        result.points += [_point(q, t) for t in ((arrive, leave) if pace.dwell > 0 else (arrive,))]
+    return result
+
+
+def _point(positions: list[float], seconds: float) -> JointTrajectoryPoint:
+    after = round(float(seconds) * NANO)
+    point = JointTrajectoryPoint(positions=positions, velocities=[0.0] * len(positions))
+    point.time_from_start = Duration(sec=after // NANO, nanosec=after % NANO)
+    return point

@@ -1,0 +1,228 @@
+"""Which robot the planner plans for: a shipped one by name, or the URDF heard on ``robot_description``.
+
+Anyone on the graph may publish a robot description, so it is bounded before it is parsed (length, number of
+links and joints), and ``robot.urdf`` refuses document types, which are the way to entities. What is refused
+changes nothing: the robot before it stays, heard or by name, or whoever sends rubbish could take the planner out
+of service. Since the refused one may be the machine that is there, ``refusal`` is said beside every plan until a
+description is accepted again; and no machine executes a plan of another robot's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from calib_planner.arrays import FloatArray, frozen
+from calib_planner.errors import CalibPlannerError, FileFormatError
+from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, stored_model
+from calib_planner.planning import Plan
+from calib_planner.robot import Robot
+from calib_planner.ros.settings import (
+    IdentifierParameters,
+    PlannerParameters,
+    load_shipped,
+    unknown_words,
+    with_topics,
+)
+from calib_planner.units import brief, cut
+
+TOPIC = "robot_description"
+LONGEST_TEXT = 4_000_000
+"""Characters of a description; the longest in common use have some 400 000."""
+MOST_ITEMS = 2000
+"""Links, and joints, of a description."""
+MOST_MOVING = 64
+"""Moving joints of the chain."""
+LONGEST_NAME = 200
+
+
+class NotReady(CalibPlannerError):
+    """There is no robot to plan for; the text says what is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot and what else is known of it.
+
+    Attributes:
+        robot: Its geometry.
+        speeds: (joints,) speed limits of the description [rad/s | m/s]; infinite where none is known.
+        described: Whether it was heard, not loaded by name.
+    """
+
+    robot: Robot
+    speeds: FloatArray
+    described: bool = False
+
+
+def shipped_model(name: str, parameters: str | Sequence[str], unknown: str) -> Model:
+    """A robot by name.
+
+    Raises:
+        UnknownNameError: Not a shipped robot, or it has no such parameters.
+    """
+    words = unknown_words(unknown)
+    robot = _loaded(name).with_parameters(parameters, words)
+    return Model(robot, _no_limits(robot))
+
+
+@lru_cache(maxsize=16)
+def _loaded(name: str) -> Robot:
+    """Read once: a request that names a robot should not wait for its file."""
+    return load_shipped(name, "full")
+
+
+def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model:
+    """The robot of a URDF from the wire.
+
+    Raises:
+        FileFormatError: Too large, not a URDF, or no single chain between the links.
+    """
+    _check_size(text)
+    robot = parse_urdf(text, TOPIC, base_link or None, tip_link or None)
+    if len(robot.joint_names) > MOST_MOVING:
+        got, advice = f"{len(robot.joint_names)} moving joints in the chain", "set base_link and tip_link"
+        raise FileFormatError(TOPIC, "chain", got, f"at most {MOST_MOVING}", advice)
+    for name in (robot.name, *robot.joint_names):
+        if len(name) > LONGEST_NAME or not name.isprintable():
+            raise FileFormatError(TOPIC, "name", brief(name, 40), f"at most {LONGEST_NAME} printable characters")
+    speeds = parse_speed_limits(text, TOPIC, robot.joint_names)
+    return Model(robot, _no_limits(robot) if speeds is None else speeds, described=True)
+
+
+def _no_limits(robot: Robot) -> FloatArray:
+    return frozen(np.full(len(robot.joint_names), np.inf))
+
+
+def _check_size(text: str) -> None:
+    if len(text) > LONGEST_TEXT:
+        raise FileFormatError(TOPIC, "text", f"{len(text)} characters", f"at most {LONGEST_TEXT}")
+    for item in ("link", "joint"):
+        count = text.count(f"<{item}")
+        if count > MOST_ITEMS:
+            raise FileFormatError(TOPIC, f"<{item}>", f"{count} of them", f"at most {MOST_ITEMS}")
+
+
+class ModelSource:
+    """The model in force; the only thing here that changes, by assignment of one value at a time.
+
+    Attributes:
+        refusal: Why the newest description was refused and what stays; empty if it was not.
+    """
+
+    def __init__(self, settings: PlannerParameters) -> None:
+        self._settings = settings
+        self._text = self.refusal = ""
+        self._found: Model | NotReady = NotReady(
+            f"no robot yet: publish a URDF on {TOPIC} (latched), or set the parameter robot; "
+            "a request may also name a shipped robot"
+        )
+        if settings.robot:
+            self._found = shipped_model(settings.robot, settings.parameters, settings.unknown)
+
+    @property
+    def model(self) -> Model | NotReady:
+        """The model, or why there is none."""
+        return self._found
+
+    def take(self, text: str) -> Model | None:
+        """Take a description; ``None`` if it is the one in force.
+
+        Raises:
+            CalibPlannerError: It is refused; ``refusal`` says what that means.
+        """
+        if text and text == self._text:
+            self.refusal = ""
+            return None
+        try:
+            found = described_model(text, self._settings.base_link, self._settings.tip_link)
+        except CalibPlannerError as error:
+            self.refusal = f"{TOPIC} refused: {cut(error, 800)}"
+            if isinstance(self._found, Model):
+                self.refusal += f"; {self._found.robot.name} stays the robot"
+            else:
+                self._found = NotReady(self.refusal)
+            raise
+        self._found, self._text, self.refusal = found, text, ""
+        return found
+
+
+# ── Which robot the identifier identifies, with the text that says so ───────────────────────────────────────
+# A shipped robot by name, a URDF heard on ``robot_description``, or the one that a campaign in the store belongs
+# to. The text is kept with the campaign: a model that changes under it would change what its measurements say.
+
+DEFAULT_LEVEL = "lengths+offsets"
+"""What is identified while neither a parameter nor a plan says so."""
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedModel:
+    """A robot with a target per topic.
+
+    Attributes:
+        robot: Its active parameters are those of the node's parameter.
+        stored: What a store says of it.
+        settings: The node's parameters.
+    """
+
+    robot: Robot
+    stored: StoredModel
+    settings: IdentifierParameters
+
+    @property
+    def urdf(self) -> str:
+        """The URDF it was read from; empty if it was not read from one."""
+        return self.stored.source if self.stored.origin == TOPIC else ""
+
+    def follow(self, plan: Plan) -> Robot:
+        """The robot with the parameters that a plan is for, unless the node's own say otherwise.
+
+        Raises:
+            UnknownNameError: It has no such parameters.
+        """
+        chosen = self.settings
+        return self.robot.with_parameters(chosen.parameters or plan.parameters, unknown_words(chosen.unknown))
+
+
+def first_model(settings: IdentifierParameters) -> IdentifiedModel | None:
+    """The model to begin with; ``None`` if a description has to be waited for.
+
+    Raises:
+        CalibPlannerError: There is no such robot, or the store cannot be used.
+    """
+    if settings.use_robot_description:
+        stored = stored_model(settings.store_folder)
+        if stored is not None and stored.origin == TOPIC:
+            return heard_model(stored.source, settings)
+    return shipped_robot_model(settings) if settings.robot else None
+
+
+def shipped_robot_model(settings: IdentifierParameters) -> IdentifiedModel:
+    """The robot that the parameter ``robot`` names.
+
+    Raises:
+        CalibPlannerError: There is no such robot, or it has no such parameters or targets.
+    """
+    level, topics = settings.parameters or DEFAULT_LEVEL, len(settings.tracker_topics)
+    robot = load_shipped(settings.robot, level, settings.unknown, topics)
+    return _model(robot, read_text(robot.source, "a robot YAML"), settings.robot, settings)
+
+
+def heard_model(text: str, settings: IdentifierParameters) -> IdentifiedModel:
+    """The robot of a URDF from the wire.
+
+    Raises:
+        CalibPlannerError: It is refused.
+    """
+    found = described_model(text, settings.base_link, settings.tip_link).robot
+    robot = with_topics(found, len(settings.tracker_topics), settings.unknown)
+    level = settings.parameters or DEFAULT_LEVEL
+    return _model(robot.with_parameters(level, unknown_words(settings.unknown)), text, TOPIC, settings)
+
+
+def _model(robot: Robot, text: str, origin: str, settings: IdentifierParameters) -> IdentifiedModel:
+    stored = StoredModel(robot.name, robot.joint_names, len(robot.targets), text, origin)
+    return IdentifiedModel(robot, stored, settings)

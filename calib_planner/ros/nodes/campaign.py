@@ -1,0 +1,340 @@
+"""Node ``calibration_campaign``: measures until it is accurate enough, with the robot and identifier there are.
+
+What is done next is said by ``adaptive`` (a pure state machine); plans are made by the library in a thread of
+their own. This file carries it out: it tells the identifier the plan (latched ``~/plan``, the identifier's
+``plan_topic``), has the robot sent to one configuration at a time (``campaign_measuring``), and hears what was
+accepted. The identifier is to keep measurements over plans (``keep_measurements``): every plan of the fit holds
+all that was measured before. The validation's holds the validation only, and after it the fit's plan is told
+again, so that in the end the identifier's own estimate, too, is that of the fit.
+
+Nothing is sent anywhere before ``~/start``, nor after a restart before ``~/resume``. All callbacks take turns in
+one thread.
+"""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
+
+from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
+from calib_planner_msgs.msg import Plan as PlanMessage
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from calib_planner.campaign import (
+    CampaignResult,
+    CampaignState,
+    Decision,
+    Finished,
+    Measure,
+    Paused,
+    begin,
+    decide,
+)
+from calib_planner.errors import CalibPlannerError, InputError, StoreError
+from calib_planner.io import Journal, begin_journal, open_journal
+from calib_planner.ros.campaign import (
+    Measuring,
+    idle_status,
+    problem_of,
+    reasons_of,
+    result_message,
+    status_message,
+    write_result,
+)
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.model import TOPIC, Model, ModelSource
+from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.rclpy_ext.run import run
+from calib_planner.ros.settings import CampaignParameters
+from calib_planner.units import cut
+
+PERIOD = 0.05
+"""Time between two looks at what there is to do [s]."""
+PATIENCE = 4.0
+"""Time that a plan gets to end when it is stopped [s]."""
+
+
+class CampaignNode(ManagedNode[CampaignParameters]):
+    """See the module.
+
+    Attributes:
+        campaign: The state of the campaign, ``None`` before the first.
+    """
+
+    THREADS = 1
+
+    def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
+        self._stop = threading.Event()
+        self._work: Future[Decision] | None = None
+        self._work_for = ""
+        self._forget()
+        super().__init__("calibration_campaign", CampaignParameters(), context, overrides)
+
+    def _forget(self) -> None:
+        self.campaign: CampaignState | None = None
+        self._journal: Journal | None = None
+        self._id, self._reason, self._sent = "", "call ~/start", ""
+        self._reported = False
+
+    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
+
+    def configure(self) -> None:
+        """Load the robot, offer services, listen."""
+        chosen = self.settings.value
+        self._forget()
+        self._source = ModelSource(chosen)  # type: ignore[arg-type]
+        self._status = self.create_publisher(CampaignStatus, "~/status", LATCHED)
+        self._estimates = self.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
+        self._measuring = Measuring(self, self.create_publisher(PlanMessage, "~/plan", LATCHED))
+        if chosen.use_robot_description:
+            self.create_subscription(String, TOPIC, self._on_description, LATCHED)
+        name = chosen.identifier
+        self.create_subscription(Measurement, f"{name}/measurements", self._on_measurement, EVENTS)
+        self.create_subscription(CalibrationEstimate, f"{name}/estimate", self._on_estimate, LATCHED)
+        for name in ("start", "pause", "resume", "skip"):
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
+
+    def activate(self) -> None:
+        """Look after the campaign; one in the store goes on when it is told to."""
+        self._stop.clear()
+        self._pool = ThreadPoolExecutor(1, "campaign")
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
+        self.create_timer(PERIOD, self._tick, clock=steady)
+        self._go_on_with_stored()
+        self.get_logger().info(self._reason)
+        self._publish_status()
+
+    def deactivate(self) -> None:
+        """Stop the robot and the plan that is being made; measurements stay."""
+        self._measuring.leave()
+        self._stop.set()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        if self._work is not None and self._work in wait([self._work], PATIENCE).done:
+            self._work = None
+
+    def clean_up(self) -> None:
+        """Forget the campaign; what is in the store stays."""
+        self._forget()
+
+    def close(self) -> bool:
+        """End everything; whether the plan that was being made ended in time."""
+        super().close()
+        return self._work is None
+
+    def _go_on_with_stored(self) -> None:
+        """The campaign of the journal, paused: nobody shall be surprised by a robot that moves."""
+        chosen, model = self.settings.value, self._source.model
+        if self.campaign is not None or not chosen.store_folder or not isinstance(model, Model):
+            return
+        if not chosen.test_pose_rows:
+            return
+        try:
+            problem = problem_of(chosen, model)
+            stored = open_journal(chosen.store_folder, problem.robot)
+            if stored is None or stored.finished:
+                return
+            self.campaign = stored.state(problem).pause()
+        except CalibPlannerError as error:
+            self._reason = f"the campaign in the store cannot go on: {error}"
+            self.get_logger().error(self._reason)
+            return
+        self._id, self._journal = stored.campaign_id, stored.journal
+        self._measuring.begin(self._id)
+        self._reason = f"{len(stored.rows)} measurements of campaign {self._id} are there: call ~/resume to go on"
+
+    # ── services ─────────────────────────────────────────────────────────────────────────────────────
+
+    def _serve(
+        self, action: Callable[[], str], _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        try:
+            if not self.is_active:
+                raise InputError("node", self.state, "active", "activate it")
+            response.message, response.success = action(), True
+        except CalibPlannerError as error:
+            response.message, response.success = cut(error), False
+        self._publish_status()
+        return response
+
+    def _start(self) -> str:
+        before = self.campaign
+        if before is not None and before.result is None and before.rows:
+            raise InputError(
+                "start", "a campaign that is not finished", "none", "resume it, or clean up the node"
+            )
+        if self._work is not None or self._measuring.busy:
+            raise InputError("start", "what was stopped has not ended", "nothing under way", "ask again")
+        problem = problem_of(self.settings.value, self._source.model)
+        folder = self.settings.value.store_folder
+        name = uuid.uuid4().hex[:12]
+        journal = begin_journal(folder, name, problem.robot) if folder else None
+        self._forget()
+        self._id, self._journal, self.campaign = name, journal, begin(problem)
+        self._measuring.begin(name)
+        self._reason = ""
+        kept = f"kept in {folder}" if folder else "in memory only: set store_folder to keep it"
+        return f"campaign {name} of {problem.robot.name} begun, {kept}"
+
+    def _pause(self) -> str:
+        self._set(self._running("pause").pause())
+        self._reason = "paused on request: call ~/resume"
+        return "paused; the robot stops, what was measured stays"
+
+    def _resume(self) -> str:
+        state = self._running("resume")
+        if not state.paused:
+            return "it was not paused"
+        self._reason = ""
+        self._measuring.leave()
+        self._set(state.resume())
+        return "goes on"
+
+    def _skip(self) -> str:
+        state = self._running("skip")
+        visit = self._measuring.visit
+        if visit is None or not isinstance(state.action, Measure) or visit.action.index != state.action.index:
+            raise InputError("skip", "no configuration is being measured", "one that is", "see ~/status")
+        self._set(state.skipped(visit.action.index))
+        return f"configuration {visit.action.index} and what is near it are left out"
+
+    def _running(self, what: str) -> CampaignState:
+        if self.campaign is None or self.campaign.result is not None:
+            raise InputError(what, "no campaign under way", "one", "call ~/start")
+        return self.campaign
+
+    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
+
+    def _on_description(self, message: String) -> None:
+        try:
+            model = self._source.take(message.data)
+        except CalibPlannerError:
+            self.get_logger().error(self._source.refusal, throttle_duration_sec=1.0)
+            return
+        if model is not None:
+            self.get_logger().info(f"{TOPIC}: {model.robot.name}; it counts from the next campaign on")
+            if self.is_active:
+                self._go_on_with_stored()
+
+    def _on_estimate(self, message: CalibrationEstimate) -> None:
+        self._measuring.taken = message.plan_id
+
+    def _on_measurement(self, message: Measurement) -> None:
+        state = self.campaign
+        if state is None or state.result is not None:
+            return
+        try:
+            self._set(self._measuring.heard(message, state))
+        except InputError as error:
+            self.get_logger().warning(f"measurement refused: {cut(error, 500)}", throttle_duration_sec=1.0)
+
+    # ── the campaign goes on ─────────────────────────────────────────────────────────────────────────
+
+    def _set(self, state: CampaignState) -> None:
+        """A new state, on the disk before it is in force."""
+        before = self.campaign
+        if before is state:
+            return
+        if self._journal is not None and before is not None:
+            try:
+                self._journal.note(before, state)
+            except StoreError as error:
+                self._journal = None
+                state = state.pause()
+                self._reason = f"paused: not kept on disk any more, {error}; ~/resume goes on without"
+                self.get_logger().error(self._reason)
+        self.campaign = state
+
+    def _tick(self) -> None:
+        self._take_decision()
+        state = self.campaign
+        if state is not None:
+            self._go_on(state)
+        self._publish_status()
+
+    def _go_on(self, state: CampaignState) -> None:
+        action, measuring = state.action, self._measuring
+        if isinstance(action, Measure):
+            self._set(measuring.step(state, action))
+            if measuring.waited > self.settings.value.longest_wait:
+                self._pause_for(f"{measuring.waiting}; call ~/resume once that is remedied")
+            return
+        measuring.leave()
+        if isinstance(action, Finished):
+            self._finish(action.result)
+        elif not isinstance(action, Paused) and self._work is None:
+            self._work, self._work_for = self._pool.submit(decide, state, self._stop.is_set), self._id
+
+    def _take_decision(self) -> None:
+        if self._work is None or not self._work.done() or self.campaign is None:
+            return
+        work, self._work = self._work, None
+        if self._work_for != self._id:
+            return  # of a campaign that was left
+        try:
+            decision = work.result()
+        except CalibPlannerError as error:
+            self._pause_for(str(error))
+            return
+        except Exception as error:
+            self._pause_for(f"{type(error).__name__}: {error}")
+            return
+        self._set(self.campaign.decided(decision))
+        self.get_logger().info(f"round {len(self.campaign.rounds)}: {decision.message}")
+
+    def _pause_for(self, reason: str) -> None:
+        self._reason = f"paused: {cut(reason, 800)}"
+        self.get_logger().error(self._reason)
+        if self.campaign is not None:
+            self._set(self.campaign.pause())
+
+    def _finish(self, result: CampaignResult) -> None:
+        """Tell the result, once; the identifier goes back to the fit."""
+        if self._reported:
+            return
+        self._reported = True
+        self.get_logger().info(f"{result.outcome}: {result.message}")
+        for reason in reasons_of(result.verdict) or [result.verdict.level]:
+            self.get_logger().info(reason)
+        message = result_message(result, self._id)
+        if message is not None:
+            message.header.stamp = stamp_message(self.get_clock().now().nanoseconds)
+            self._estimates.publish(message)
+        self._measuring.back_to_fit()
+        folder = self.settings.value.store_folder
+        if folder:
+            try:
+                write_result(folder, result, self._id)
+                self._reason = f"results are in {folder}"
+            except CalibPlannerError as error:
+                self._reason = f"the results were not written: {error}"
+                self.get_logger().error(self._reason)
+
+    def _publish_status(self) -> None:
+        """If it is another than before."""
+        if self.campaign is None:
+            message = idle_status(self._reason)
+        else:
+            message = status_message(self.campaign, self._id, self._measuring.waiting, self._reason)
+        text = repr(message)
+        if text != self._sent:
+            self._sent = text
+            message.header.stamp = stamp_message(self.get_clock().now().nanoseconds)
+            self._status.publish(message)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until it is told to end."""
+    return run(CampaignNode, CampaignNode.THREADS, args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

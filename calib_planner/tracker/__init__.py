@@ -1,0 +1,11 @@
+"""What the laser tracker is worth: the covariance of a measured point, and what it can see from its station."""
+
+from calib_planner.tracker.noise import Isotropic, LaserTracker, Noise, covariance_gradient
+from calib_planner.tracker.visibility import (
+    check_direction,
+    distances,
+    elevations,
+    incidence_cosines,
+    segment_distances,
+    shortened,
+)

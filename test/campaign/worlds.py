@@ -1,0 +1,46 @@
+"""Campaigns on simulated cells, and what came true of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from calib_planner import Robot
+from calib_planner.campaign import CampaignProblem, CampaignResult, run_campaign
+from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations, simulated
+
+POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
+SIGMA = 3e-5
+
+
+def world_of(robot: Robot, seed: int, sigma: float = SIGMA, transmission: float = 0.0) -> World:
+    cell = SimulatedCell(robot, random_deviations(robot, seed), sigma)
+    return World(cell, Faults(transmission_error=transmission), seed)
+
+
+def kuka(required: float = 15e-6, seed: int = 0, **changes: object) -> CampaignProblem:
+    values = {"robot": Robot.load("kuka_kr270"), "test_poses": POSE, "starts": 4, "seed": seed, **changes}
+    return CampaignProblem(required_accuracy=required, sigma=SIGMA, **values)  # type: ignore[arg-type]
+
+
+def planar(required: float = 12e-6, seed: int = 0, **changes: object) -> CampaignProblem:
+    robot = Robot.load("planar_2r")
+    pose = np.radians([10.0, 50.0])
+    values = {"robot": robot, "test_poses": pose, "starts": 4, "seed": seed, **changes}
+    return CampaignProblem(required_accuracy=required, sigma=SIGMA, **values)  # type: ignore[arg-type]
+
+
+def campaign(
+    problem: CampaignProblem, world: World, reaches: Callable[[np.ndarray], bool] = lambda q: True
+) -> CampaignResult:
+    return run_campaign(problem, simulated(world, problem.seed, reaches))
+
+
+def achieved(result: CampaignResult, world: World, poses: np.ndarray) -> float:
+    """Largest true error at the test poses [m], with all that was learnt."""
+    assert result.estimate is not None
+    poses = np.atleast_2d(poses)
+    stand = Stand(poses, np.arange(len(poses)), np.full(len(poses), np.inf))
+    off = result.estimate.positions(poses) - world.targets(stand)
+    return float(np.linalg.norm(off, axis=2).max())

@@ -1,0 +1,74 @@
+"""What users get from ``calib-planner`` is what ``expected/`` says; see README.md."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from cases import CASES, REAL, Case
+from golden import EXPECTED, Inputs, answer, differences, kept, stored
+
+MOST_SHOWN = 20
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    return Inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
+def test_users_get_the_same(case: Case, inputs: Inputs, tmp_path: Path) -> None:
+    if case.real and not REAL.is_dir():
+        pytest.skip(f"no measured data in {REAL}")
+    found = differences(stored(case.name), kept(answer(case, inputs, tmp_path)))
+    first = list(islice(found, MOST_SHOWN))
+    assert not first, "\n".join([f"calib-planner {case.line}", *first, "intended? python test/golden/update.py"])
+
+
+def test_every_expected_file_has_its_case() -> None:
+    names = [c.name for c in CASES]
+    assert len(set(names)) == len(names)
+    assert {p.stem for p in EXPECTED.glob("*.json")} == {*names, "nodes", "interfaces"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        (1.0, 1.0 + 1e-13, True),
+        (1.0, 1.0 + 1e-11, False),
+        (0.0, 1e-30, False),
+        ([1.0, 0.0], [1.0, 1e-15], True),
+        ([1.0, 0.0], [1.0, 1e-13], False),
+        ([[1.0, 0.0], [0.0, 2.0]], [[1.0, 0.0], [1e-15, 2.0]], True),
+        (1, 1.0, False),
+        (1.0, True, False),
+        (1, True, False),
+        (None, 0.0, False),
+        ([1.0], [1.0, 2.0], False),
+        ({"a": 1}, {"a": 1, "b": 2}, False),
+        ({"a": 1, "b": 2}, {"a": 1}, False),
+        ({"status": "ok"}, {"status": "Ok"}, False),
+        ({"message": "Done."}, {"message": "Ready."}, True),
+        ({"message": "Done."}, {"message": ""}, False),
+        ({"message": "Done."}, {"message": None}, False),
+        ({"combination": "1·a + 0.333·b"}, {"combination": "1·a + 0.334·b"}, True),
+        ({"combination": "1·a + 0.333·b"}, {"combination": "1·a + 0.333·c"}, False),
+        ({"combination": "1·a + 0.333·b"}, {"combination": "1·a + 0.393·b"}, False),
+    ],
+)
+def test_what_counts_as_the_same(old: object, new: object, same: bool) -> None:
+    assert (not list(differences(old, new))) == same
+
+
+def test_long_lists_are_summed_without_losing_an_entry() -> None:
+    rows: list[list[float | None]] = [[0.1 * i - 3.05 + j for j in range(4)] for i in range(50)]
+    before = kept(rows)
+    assert rows[20][1] == pytest.approx(-0.05)
+    assert before["shape"] == [50, 4] and not list(differences(before, kept(rows)))
+    for value in (-0.05 + 1e-9, 0.05, None):
+        changed = [list(row) for row in rows]
+        changed[20][1] = value
+        assert list(differences(before, kept(changed))), value
+    swapped = [*rows[:20], rows[21], rows[20], *rows[22:]]
+    assert list(differences(before, kept(swapped)))

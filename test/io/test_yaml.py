@@ -1,0 +1,340 @@
+"""Plans and estimates as YAML: exact round trips, and every flaw is named by its key."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from robots import mixed, random_configurations
+
+from calib_planner import (
+    Estimate,
+    FileFormatError,
+    IdentificationProblem,
+    InputError,
+    Plan,
+    PlanProblem,
+    Robot,
+    identify,
+    plan,
+)
+from calib_planner.identification import JointCorrections, Prior, cross_validate, validate
+from calib_planner.identification.transmission import Transmission
+from calib_planner.io import read_estimate, read_plan, write_estimate, write_plan
+from calib_planner.io.plan import FINITE as FINITE_ARRAYS
+from calib_planner.io.plan import SHAPES
+from calib_planner.measurements import Measurements
+from calib_planner.simulation import SimulatedCell
+
+ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
+FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
+TEXT = st.text(max_size=20)
+
+
+@st.composite
+def plans(draw: st.DrawFn) -> Plan:
+    """Any plan at all: fields by their annotation, arrays of fitting shapes."""
+    count = {k: draw(st.integers(1, 4)) for k in ("configurations", "joint_names", "weights", "parameters")}
+    drawn: dict[str, Any] = {}
+    for f in fields(Plan):
+        shape = tuple(count[a] for a in SHAPES.get(f.name, ()))
+        names = st.lists(TEXT, min_size=count.get(f.name, 0), max_size=count.get(f.name, 3))
+        floats = hnp.arrays(float, shape, elements=FINITE if f.name in FINITE_ARRAYS else ANY)
+        kinds: dict[str, st.SearchStrategy[Any]] = {
+            "str": TEXT,
+            "int": st.integers(0, 2**63 - 1),
+            "float": ANY,
+            "tuple[str, ...]": names.map(tuple),
+            "FloatArray": floats,
+            "IntArray": hnp.arrays(np.int64, shape, elements=st.integers(1, 10**9)),
+        }
+        drawn[f.name] = draw(kinds[str(f.type)])
+    return Plan(**drawn)
+
+
+@settings(max_examples=60, deadline=None)
+@given(written=plans())
+def test_plans_come_back_to_the_bit(written: Plan) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.yaml"
+        write_plan(path, written)
+        read = read_plan(path)
+    for f in fields(Plan):
+        want, have = getattr(written, f.name), getattr(read, f.name)
+        assert type(want) is type(have)
+        if isinstance(want, np.ndarray):
+            assert want.dtype == have.dtype
+            np.testing.assert_array_equal(want, have)
+            np.testing.assert_array_equal(np.signbit(want[want == 0]), np.signbit(have[have == 0]))
+        else:
+            assert repr(want) == repr(have)
+
+
+@pytest.fixture(scope="module")
+def small_plan() -> Plan:
+    return plan(PlanProblem(Robot.load("planar_2r"), [[0.2, 0.4]], 3, starts=4))
+
+
+def change(path: Path, **changes: Any) -> Path:
+    document = yaml.safe_load(path.read_text())
+    for key, value in changes.items():
+        if value is None:
+            del document[key]
+        else:
+            document[key] = value
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "key missing": ({"joint_names": None}, "no key 'joint_names'"),
+    "key unknown": ({"colour": "red"}, "unknown key 'colour'"),
+    "other kind": ({"format": "calib_planner/estimate"}, "expected calib_planner/plan"),
+    "words for numbers": ({"configurations": [["a", "b"]]}, "configurations: expected a list of numbers"),
+    "ragged": ({"configurations": [[1.0], [1.0, 2.0]]}, "configurations: expected a list of numbers"),
+    "joints do not fit": ({"configurations": [[1.0], [2.0], [3.0]]}, r"configurations.*shape \(3, 2\)"),
+    "not finite": (
+        {"configurations": [[0.0, 1.0], [0.0, float("nan")], [0.0, 1.0]]},
+        "configurations: expected finite",
+    ),
+    "repetitions": ({"repetitions": [1, 1]}, "repetitions: expected an array"),
+    "repetitions of zero": ({"repetitions": [1, 0, 1]}, "repetitions: expected whole numbers >= 1"),
+    "half repetitions": ({"repetitions": [1, 1.5, 1]}, "repetitions: expected a list of whole numbers"),
+    "name is a number": ({"robot": 3}, "robot: expected text"),
+    "flag for a number": ({"sigma": True}, "sigma: expected a number"),
+    "names": ({"joint_names": "q1"}, "joint_names: expected a list of names"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_flawed_plans_are_refused(tmp_path: Path, small_plan: Plan, case: str) -> None:
+    changes, message = BAD[case]
+    path = tmp_path / "plan.yaml"
+    write_plan(path, small_plan)
+    with pytest.raises(FileFormatError, match=message) as caught:
+        read_plan(change(path, **changes))
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "just words",
+        "[1, 2]",
+        "a: [1",
+        "a: &x [1]\nb: *x",
+        "!!python/object/apply:os.getcwd []",
+        "[" * 5000,
+    ],
+    ids=["empty", "scalar", "list", "syntax", "alias", "object", "deep"],
+)
+def test_what_is_no_document_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match="calib_planner/plan"):
+        read_plan(path)
+
+
+# ── estimates ────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def placed() -> Estimate:
+    """Base and targets unknown, a parameter that cannot be told apart, test poses, held-out data, a prior."""
+    nominal = mixed()
+    cell = SimulatedCell(
+        nominal, {"turn.offset": 0.02, "slide.x": 1e-3, "base.x": 2.0, "base.rz": 2.5, "target_1.z": 0.1}
+    )
+    data = cell.measure(random_configurations(nominal, 40), 1, 2)
+    robot = nominal.with_parameters("full", ["base", "tool"])
+    test = cell.measure(random_configurations(nominal, 8, 3), 1, 4)
+    prior = Prior(("spin.z",), [0.5], [1e-3])
+    problem = IdentificationProblem(robot, data, test_poses=[[0.1, 0.2, 0.3, 0.4]], prior=prior)
+    found = identify(problem)
+    return cross_validate(problem, validate(problem, found, [test]), 3)
+
+
+def numbers(value: Any) -> Any:
+    """NaN as null, arrays as lists, infinities as they are: what a YAML document of it holds."""
+    if isinstance(value, np.ndarray):
+        return numbers(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [numbers(v) for v in value]
+    if isinstance(value, dict):
+        return {k: numbers(v) for k, v in value.items()}
+    return None if isinstance(value, float) and np.isnan(value) else value
+
+
+def test_estimates_come_back_to_the_bit(tmp_path: Path, placed: Estimate) -> None:
+    path, again = tmp_path / "estimate.yaml", tmp_path / "again.yaml"
+    write_estimate(path, placed)
+    read = read_estimate(path)
+    for name in ("nominal", "values", "deviations", "std", "covariance"):
+        assert getattr(read, name).tobytes() == getattr(placed, name).tobytes(), name
+        assert not getattr(read, name).flags.writeable
+    assert np.isnan(read.std).sum() == len(placed.held) > 0 and read.status == "rank_deficient"
+    assert (read.parameters, read.units, read.sigma) == (placed.parameters, placed.units, placed.sigma)
+    assert read.predicted_accuracy_per_test_pose.tobytes() == placed.predicted_accuracy_per_test_pose.tobytes()
+    assert repr(read.noise) == repr(placed.noise) and repr(read.chi_square) == repr(placed.chi_square)
+    assert read.verdict == placed.verdict
+    assert {k: v for k, v in read.document.items() if k in placed.to_dict()} == placed.to_dict()
+    write_estimate(again, read)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_a_read_estimate_is_the_robot_again(tmp_path: Path, placed: Estimate) -> None:
+    """In the tracker's frame, base and targets included, from the nominal robot as its file gives it."""
+    path = tmp_path / "estimate.yaml"
+    write_estimate(path, placed)
+    q = random_configurations(mixed(), 20, 7)
+    for nominal in (mixed(), mixed().with_targets([[0, 0, 0]])):
+        again = read_estimate(path).calibrated(nominal)
+        assert again.positions(q).tobytes() == placed.calibrated.positions(q).tobytes()
+        assert again.jacobian(q).tobytes() == placed.calibrated.jacobian(q).tobytes()
+        np.testing.assert_array_equal(read_estimate(path).complete(nominal).positions(q), again.positions(q))
+    far = np.linalg.norm(again.positions(q) - mixed().positions(q), axis=2)
+    assert far.min() > 0.1  # base and targets do matter
+    with pytest.raises(InputError, match="joints turn, slide"):
+        read_estimate(path).calibrated(Robot.load("planar_2r"))
+    with pytest.raises(InputError, match="identify again"):
+        read_estimate(change(path, base=None)).calibrated(mixed())
+
+
+def test_joint_corrections_come_back(tmp_path: Path, placed: Estimate) -> None:
+    """Beside the geometry that belongs with them, which is not the calibrated robot's."""
+    rng = np.random.default_rng(3)
+    moved = placed.calibrated.with_deviations({"slide.x": 3e-4, "base.y": 1e-4, "target_2.x": -2e-4})
+    series = rng.normal(0, 1e-3, (2, 4, 5))
+    corrections = JointCorrections(moved.joint_names, np.full(4, 0.7), rng.normal(size=4), *series)
+    count = len(moved.parameter_names) + series.size
+    model = Transmission(moved, corrections, 0.3, 1e-3, 1e-5, 0.0, 9.0, moved.parameter_names, np.eye(count))
+    written = replace(placed, transmission=model)
+    write_estimate(tmp_path / "estimate.yaml", written)
+    read = read_estimate(tmp_path / "estimate.yaml")
+    found, q = read.joint_corrections, random_configurations(moved, 10, 8)
+    assert found is not None
+    again = read.complete(mixed()).positions(found.corrections.actual(q))
+    assert again.tobytes() == written.positions(q).tobytes()
+    assert read.calibrated(mixed()).positions(q).tobytes() == written.calibrated.positions(q).tobytes()
+    document = yaml.safe_load((tmp_path / "estimate.yaml").read_text())
+    document["joint_corrections"]["sines"] = [[0.0]]
+    with pytest.raises(FileFormatError, match=r"joint_corrections.sines: .*shape \(1, 1\)"):
+        read_estimate(change(tmp_path / "estimate.yaml", joint_corrections=document["joint_corrections"]))
+
+
+def test_what_cannot_be_predicted_stays_infinite(tmp_path: Path) -> None:
+    """Data that never turn q2 leave a pose that does unpredictable; JSON has no word for it, YAML has."""
+    robot = Robot.load("planar_2r").with_parameters(["l1", "dq1", "dq2"])
+    q = [[a, 0.0] for a in np.linspace(-2, 2, 12)]
+    data = SimulatedCell(robot, {"l1": 1e-3}).measure(q, 1, 2)
+    estimate = identify(IdentificationProblem(robot, data, test_poses=[[0.1, 1.5], [0.2, 0.0]]))
+    assert np.isinf(estimate.predicted_accuracy) and estimate.to_dict()["predicted_accuracy"] is None
+    path = tmp_path / "estimate.yaml"
+    write_estimate(path, estimate)
+    read = read_estimate(path)
+    assert read.predicted_accuracy_per_test_pose.tobytes() == estimate.predicted_accuracy_per_test_pose.tobytes()
+    assert read.document["predicted_accuracy"] == np.inf and "predicted_accuracy: .inf" in path.read_text()
+    write_estimate(tmp_path / "again.yaml", read)
+    assert (tmp_path / "again.yaml").read_bytes() == path.read_bytes()
+
+
+def test_an_estimate_without_redundancy_has_no_uncertainty(tmp_path: Path) -> None:
+    """As many equations as parameters: standard deviations are unknown, and stay so."""
+    robot = Robot.load("planar_2r").with_targets([[0.1, 0.2, 0.3]]).with_parameters(["l1", "dq1", "target_1.z"])
+    q = np.array([[0.3, 0.5]])
+    data = Measurements(robot.joint_names, q, robot.positions(q) + 1e-4)
+    estimate = identify(IdentificationProblem(robot, data))
+    assert np.isnan(estimate.std).all() and np.isnan(estimate.sigma)
+    write_estimate(tmp_path / "estimate.yaml", estimate)
+    read = read_estimate(tmp_path / "estimate.yaml")
+    np.testing.assert_array_equal(read.std, estimate.std)
+    np.testing.assert_array_equal(read.covariance, estimate.covariance)
+    assert np.isnan(read.sigma) and read.deviations.tobytes() == estimate.deviations.tobytes()
+
+
+@pytest.fixture(scope="module")
+def small() -> Estimate:
+    robot = Robot.load("planar_2r")
+    data = SimulatedCell(robot, {"l1": 1e-3}).measure([[0.1, 0.5], [1.0, -0.5], [0.4, 1.2]], 1, 2)
+    return identify(IdentificationProblem(robot, data, test_poses=[[0.1, 0.2]]))
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_any_numbers_come_back(small: Estimate, data: st.DataObject) -> None:
+    """Whatever stands in an estimate: extreme, denormal, −0, infinite where that can be, any text."""
+    p = len(small.parameters)
+    finite = {n: data.draw(hnp.arrays(float, (p,), elements=FINITE)) for n in ("nominal", "deviations", "std")}
+    per = data.draw(hnp.arrays(float, (1,), elements=st.floats(0, np.inf) | st.just(np.nan)))
+    texts = {n: data.draw(TEXT) for n in ("robot", "message", "prior")}
+    with np.errstate(over="ignore", invalid="ignore"):
+        written = replace(small, **finite, **texts, parameter_accuracy_per_test_pose=per)
+        assume(np.isfinite(written.values).all())
+        with tempfile.TemporaryDirectory() as folder:
+            path, again = Path(folder) / "estimate.yaml", Path(folder) / "again.yaml"
+            write_estimate(path, written)
+            read = read_estimate(path)
+            write_estimate(again, read)
+            assert again.read_bytes() == path.read_bytes()
+        expected = numbers(written.predicted_accuracy_per_test_pose)
+    for name in finite:
+        assert getattr(read, name).tobytes() == getattr(written, name).tobytes()
+    assert numbers(read.predicted_accuracy_per_test_pose) == expected
+    assert {n: read.document[n] for n in texts} == texts
+
+
+def test_older_files_lack_what_has_a_default(tmp_path: Path, placed: Estimate) -> None:
+    path = tmp_path / "estimate.yaml"
+    write_estimate(path, placed)
+    noise = {k: v for k, v in yaml.safe_load(path.read_text())["noise"].items() if k not in ("point", "scaled")}
+    read = read_estimate(change(path, noise=noise, base=None, targets=None, verdict=None, chi_square=None))
+    assert read.noise is not None and read.noise.measurement == placed.noise.measurement
+    assert (read.noise.point, read.noise.scaled) == (0.0, 1.0)
+    assert (read.base, read.targets, read.verdict, read.chi_square) == (None, None, None, None)
+
+
+BAD_ESTIMATES: dict[str, tuple[dict[str, Any], str]] = {
+    "covariance": ({"covariance": [[1.0]]}, "covariance: expected numbers"),
+    "ragged": ({"covariance": [[1.0], [1.0, 2.0]]}, "covariance: expected a list of numbers"),
+    "key": ({"parameters": [{"name": "l1"}]}, r"parameters\[0\].*no key 'unit'"),
+    "no parameters": ({"parameters": []}, "parameters: expected a list with a row per parameter"),
+    "words": ({"sigma": "small"}, "sigma: expected a number"),
+    "base": ({"base": {"x": 0.0}}, "base: .*no key 'y'"),
+    "targets": ({"targets": [[0.0, 0.0]]}, "targets: expected numbers, any × 3"),
+    "targets of nothing": ({"targets": [[0.0, 0.0, float("nan")]]}, "targets: expected finite numbers"),
+    "noise": ({"noise": {"measurement": 1.0}}, "noise: .*no key 'source'"),
+    "noise of words": ({"noise": 3}, "noise: .*got int"),
+    "verdict": ({"verdict": {"level": "PASS", "reasons": [{"level": "PASS"}]}}, r"reasons\[0\]: .*no key 'code'"),
+    "verdict of words": ({"verdict": "PASS"}, "verdict: .*got str"),
+    "corrections": ({"joint_corrections": {"sines": []}}, "joint_corrections: .*no key 'parameters'"),
+    "kind": ({"format": "calib_planner/plan"}, "expected calib_planner/estimate"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ESTIMATES)
+def test_flawed_estimates_are_refused(tmp_path: Path, placed: Estimate, case: str) -> None:
+    changes, message = BAD_ESTIMATES[case]
+    path = tmp_path / "estimate.yaml"
+    write_estimate(path, placed)
+    with pytest.raises(FileFormatError, match=message) as caught:
+        read_estimate(change(path, **changes))
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("column", ["nominal", "value", "deviation"])
+def test_a_parameter_without_a_number_is_refused(tmp_path: Path, placed: Estimate, column: str) -> None:
+    path = tmp_path / "estimate.yaml"
+    write_estimate(path, placed)
+    rows = yaml.safe_load(path.read_text())["parameters"]
+    rows[2][column] = None
+    with pytest.raises(FileFormatError, match=rf"parameters\[\]\.{column}: expected finite numbers"):
+        read_estimate(change(path, parameters=rows))

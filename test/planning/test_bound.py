@@ -1,0 +1,346 @@
+"""The bound: no plan beats it, the proof is above everything that can be sampled, and it meets eq. (20)."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from robots import mixed, random_configurations
+
+from calib_planner import InfeasibleError, PlanProblem, Robot, plan
+from calib_planner.planning import plan_space
+from calib_planner.planning.bound import RelaxedProblem, maximise_sensitivity, relaxed_design
+from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
+from calib_planner.planning.certify.branch_and_bound import maximise
+from calib_planner.planning.certify.polynomial import polynomial, square_root
+from calib_planner.planning.certify.prove import _scale, prove_bound, prove_maximum
+from calib_planner.planning.criteria import Accuracy, Determinant, Eliminating, PowerMean
+from calib_planner.planning.information import PlanSpace
+from calib_planner.planning.search.multistart import SearchProblem, search_chunk
+from calib_planner.robot import Element
+from calib_planner.tracker import LaserTracker
+
+SLACK = 1e-9
+TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
+
+
+# ── random problems ──────────────────────────────────────────────────────────────────────────────────
+
+
+def random_chain(seed: int) -> Robot:
+    """A chain of 2 to 4 joints, turning and sliding about and along any axis, every amount with a parameter."""
+    rng = np.random.default_rng(seed)
+    joints = int(rng.integers(2, 5))
+    elements, limits = [], []
+    for k in range(joints):
+        slides = rng.random() < 0.3
+        kind = ("T" if slides else "R") + "xyz"[rng.integers(3)]
+        low = rng.uniform(-0.8, 0.0) if slides else rng.uniform(-4.0, 0.0)
+        limits.append([low, low + (rng.uniform(0.2, 1.0) if slides else rng.uniform(0.5, 7.0))])
+        sign = float(rng.choice([-1.0, 1.0]))
+        elements.append(Element(kind, float(rng.normal()), k, sign, f"joint{k}"))
+        link = "T" + "xyz"[rng.integers(3)]
+        elements.append(Element(link, float(rng.uniform(0.2, 1.5)), parameter=f"link{k}"))
+        if rng.random() < 0.5:
+            elements.append(Element("R" + "xyz"[rng.integers(3)], float(rng.normal()), parameter=f"turn{k}"))
+    names = [e.parameter for e in elements if e.parameter]
+    active = tuple(
+        sorted(rng.choice(names, int(rng.integers(2, len(names) + 1)), replace=False), key=names.index)
+    )
+    plain = Robot(f"random{seed}", tuple(elements), (), tuple(f"j{k}" for k in range(joints)), np.array(limits))
+    return dataclasses.replace(plain.with_targets(rng.normal(0.0, 0.3, (1, 3))), parameter_names=active)
+
+
+def random_problem(seed: int) -> PlanProblem:
+    """A random chain with some test poses, a criterion and perhaps a prior."""
+    robot, rng = random_chain(seed), np.random.default_rng(seed + 1)
+    names = robot.parameter_names
+    return PlanProblem(
+        robot,
+        random_configurations(robot, int(rng.integers(1, 4)), seed),
+        len(names) + int(rng.integers(0, 3)),
+        sigma=float(rng.uniform(0.1, 1.0)),
+        criterion=str(rng.choice(["test_pose", "test_pose", "worst_pose", "d", "a", "e", "d_star", "o5"])),
+        configuration_sigma=float(rng.choice([0.0, 0.3])),
+        repetitions=int(rng.integers(1, 3)),
+        prior_std={names[0]: 0.5} if rng.random() < 0.3 else {},
+        general_weight=0.0,
+        starts=4,
+        seed=seed,
+    )
+
+
+def relaxed_problem(space: PlanSpace) -> RelaxedProblem:
+    criterion = space.criterion(space.problem.criterion)
+    n = space.problem.measurements
+    return RelaxedProblem(space.single, criterion, space.prior, n, space.feasibility)
+
+
+def proven(problem: PlanProblem, rounds: int = 60):
+    """The parts of a plan with a proven bound, not yet made into one."""
+    space = plan_space(problem)
+    asked = relaxed_problem(space)
+    rng = np.random.default_rng(problem.seed)
+    design = relaxed_design(asked, problem.test_pose_array, rng, rounds=rounds)
+    return space, asked, design, *prove_bound(asked, design, rng)
+
+
+def best_worth_of_random_plans(space: PlanSpace, count: int, seed: int) -> float:
+    """Largest Ψ among random plans, every one of them regular enough to be computed."""
+    m = space.problem.configurations
+    information = space.model.at(space.feasibility.sample(np.random.default_rng(seed), count * m))
+    matrices = information.reshape(count, m, *information.shape[1:]).sum(axis=1) + space.prior
+    regular = matrices[np.linalg.cond(matrices) < 1e12]
+    criterion = space.criterion(space.problem.criterion)
+    return max((criterion.exact(matrix) for matrix in regular), default=0.0)
+
+
+def best_worth_of_search(space: PlanSpace, support: np.ndarray, weights: np.ndarray, seed: int) -> float:
+    criterion, m = space.criterion(space.problem.criterion), space.problem.configurations
+    search = SearchProblem(space.model, criterion, space.prior, m, space.feasibility, support, weights)
+    found = search_chunk(search, 3, np.random.default_rng(seed))
+    matrix = space.model.at(found.configurations).sum(axis=0) + space.prior
+    return criterion.exact(matrix) if np.linalg.cond(matrix) < 1e12 else 0.0
+
+
+# ── no plan beats its bound ──────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("block", range(10))
+def test_no_plan_of_a_random_chain_beats_its_bound(block):
+    """Two hundred random problems: chains, parameters, criteria, priors, repetitions."""
+    done = 0
+    for seed in range(20 * block, 20 * block + 20):
+        try:
+            space = plan_space(random_problem(seed))
+        except InfeasibleError:  # nothing to identify in this draw
+            continue
+        asked, tests = relaxed_problem(space), space.problem.test_pose_array
+        design = relaxed_design(asked, tests, np.random.default_rng(seed), rounds=4)
+        proof = prove_maximum(space.single, asked.criterion, design.slope, design.support)
+        assert proof.status == "proven"
+        assert proof.tolerance <= 1.1e-4
+        ceiling = proof.ceiling(space.prior, asked.measurements) * (1 + SLACK)
+        assert design.worth <= ceiling
+        assert best_worth_of_random_plans(space, 40, seed) <= ceiling
+        assert best_worth_of_search(space, design.support, design.weights, seed) <= ceiling
+        done += 1
+    assert done >= 15
+
+
+PLANAR = list(itertools.product(["l1,l2", "dq1,dq2"], [2, 3, 5], [3, 41, 77, 118, 150, 178]))
+
+
+@pytest.mark.parametrize(("pair", "m", "degrees"), PLANAR)
+def test_proven_bound_of_the_two_link_arm_is_equation_20(pair, m, degrees):
+    robot = Robot.load("planar_2r").with_parameters(pair)
+    q0 = np.radians([17.0 * m, degrees])
+    problem = PlanProblem(robot, q0, m, sigma=1.0, general_weight=0.0, starts=8)
+    _, _, design, bounded, proof = proven(problem)
+    best = (1 + abs(np.sin(q0[1]))) / m  # (20)
+    assert proof.active in ((1,), ())  # at the optimum d is constant: (B) is an equality for every plan
+    assert bounded.bound * best >= 1.0
+    assert bounded.bound <= max(bounded.worth, design.worth) * (1 + 3.5e-3)
+    assert bounded.bound * best <= 1.0 + 3.5e-3
+
+
+def test_equation_20_to_the_tolerance_of_the_proof():
+    """With the slope of the exact optimum nothing is left but the tolerance."""
+    robot = Robot.load("planar_2r").with_parameters("l1,l2")
+    for degrees, m in itertools.product([20, 65, 130], [2, 4]):
+        q0 = np.radians([0.0, degrees])
+        problem = PlanProblem(robot, q0, m, sigma=1.0, general_weight=0.0)
+        space = plan_space(problem)
+        asked = relaxed_problem(space)
+        angle = np.arccos((1 - abs(np.sin(q0[1]))) / np.cos(q0[1]))  # (19)
+        matrix = 0.5 * m * space.model.at(np.array([[0.0, angle], [0.0, -angle]])).sum(axis=0)
+        slope = asked.criterion.supporting_slope(matrix)
+        proof = prove_maximum(space.single, asked.criterion, slope, np.array([[0.0, angle]]), tolerance=1e-8)
+        ceiling = proof.ceiling(space.prior, m)
+        assert 1.0 - 1e-12 <= ceiling * (1 + abs(np.sin(q0[1]))) / m <= 1.0 + 1e-7
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_plan_of_the_kuka_beats_its_bound(seed):
+    """Random test poses: the plan searched for, and random ones."""
+    robot = Robot.load("kuka_kr270")
+    q0 = random_configurations(robot, 1, seed)
+    m = (3, 4, 6, 12)[seed % 4]
+    found = plan(PlanProblem(robot, q0, m, starts=4, general_weight=0.0, seed=seed), prove=True)
+    assert found.bound == "proven"
+    assert "proven to" in found.message
+    assert found.efficiency <= 1.0 + SLACK
+    assert found.lower_bound <= found.predicted_accuracy * (1 + SLACK)
+    space = plan_space(PlanProblem(robot, q0, m))
+    assert best_worth_of_random_plans(space, 300, seed) <= found.lower_bound**-2 * (1 + SLACK)
+
+
+# ── the proof itself ─────────────────────────────────────────────────────────────────────────────────
+
+
+def proofs():
+    robot = Robot.load("kuka_kr270")
+    yield PlanProblem(robot, TEST_POSE, 4)
+    yield PlanProblem(robot, random_configurations(robot, 3, 9), 6, criterion="worst_pose")
+    yield PlanProblem(mixed().with_parameters("offsets"), np.zeros(4), 6)
+    yield PlanProblem(random_chain(3), None, 12, criterion="d")
+
+
+@pytest.mark.parametrize("problem", list(proofs()), ids=lambda p: f"{p.robot.name} {p.criterion}")
+def test_proven_maximum_is_above_every_sample_and_every_polished_maximum(problem):
+    space, asked, _, bounded, proof = proven(problem, rounds=10)
+    q = random_configurations(space.robot, 100_000, 7)
+    jacobian = np.ascontiguousarray(space.robot.jacobian(q))
+    height = np.sum((jacobian @ square_root(bounded.slope)) ** 2, axis=(1, 2)) / problem.sigma**2
+    assert height.max() <= proof.maximum_upper
+    peaks = maximise_sensitivity(asked, bounded.slope, q[np.argsort(-height)[:40]])
+    assert np.exp(-peaks.value.min()) <= proof.maximum_upper * (1 + SLACK)
+    assert proof.maximum_upper <= proof.maximum_found * (1 + 1.1e-4)
+    at_found = np.sum(space.single.at(proof.where[None])[0] * proof.slope)
+    assert at_found == pytest.approx(proof.maximum_found, rel=1e-6)
+    low, high = space.robot.joint_limits.T
+    assert ((low - 1e-9 <= proof.where) & (proof.where <= high + 1e-9)).all()
+
+
+def test_joints_without_effect_are_dropped_and_the_others_kept():
+    space, _, _, bounded, proof = proven(PlanProblem(Robot.load("kuka_kr270"), TEST_POSE, 4))
+    assert proof.active == (1, 2, 3, 4)
+    d = polynomial(space.single, square_root(bounded.slope))
+    assert d.allowance < 1e-6 * proof.maximum_upper
+    based = Robot.load("kuka_kr270").with_parameters("lengths", ("base",))
+    assert 0 in proven(PlanProblem(based, TEST_POSE, 6), rounds=2)[4].active
+
+
+def test_polynomial_is_the_sensitivity():
+    space, _, _, bounded, _ = proven(PlanProblem(mixed(), np.zeros(4), 8), rounds=2)
+    d = polynomial(space.single, square_root(bounded.slope))
+    q = random_configurations(space.robot, 50, 1)
+    expected = np.einsum("nab,ab->n", space.single.at(q), bounded.slope)
+    for row, value in zip(q, expected, strict=True):
+        got = d.tensor
+        for k, axis in zip(d.active, d.axes, strict=True):
+            got = np.tensordot(axis.harmonics(row[k : k + 1])[0], got, 1)
+        assert got == pytest.approx(value, rel=1e-9)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+@pytest.mark.parametrize("half", [0.01, 0.4, np.pi / 3, 1.5])
+def test_bernstein_basis_is_a_weighting_and_halves_agree(turns, half):
+    s = np.linspace(-half, half, 41)
+    weights = basis(half, s, turns)
+    assert (weights >= -1e-15).all()
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-13)
+    coefficients = np.random.default_rng(0).normal(size=weights.shape[1])
+    for side, matrix in zip((-0.5, 0.5), halves(half, turns), strict=True):
+        inner = np.linspace(-half / 2, half / 2, 11)
+        expected = basis(half, inner + side * half, turns) @ coefficients
+        np.testing.assert_allclose(basis(half / 2, inner, turns) @ matrix @ coefficients, expected, atol=1e-12)
+
+
+def test_first_boxes_cover_the_axes_and_hold_the_polynomial():
+    axes = (Axis.of(-4.0, 3.9, True), Axis.of(-0.2, 0.9, False), Axis.of(0.1, 0.8, True))
+    assert (axes[0].low, axes[0].high) == (-np.pi, np.pi)
+    tensor = np.random.default_rng(2).normal(size=(5, 3, 5))
+    volume = 0.0
+    for centre, form in first_boxes(axes, tensor):
+        half = np.array([a.pieces[1] for a in axes])
+        volume += np.prod(2 * half)
+        for t in np.random.default_rng(3).uniform(centre - half, centre + half, (20, 3)):
+            value, bern = tensor, form
+            for k, axis in enumerate(axes):
+                value = np.tensordot(axis.harmonics(t[k : k + 1])[0], value, 1)
+                bern = np.tensordot(basis(half[k], t[k : k + 1] - centre[k], axis.turns)[0], bern, 1)
+            assert bern == pytest.approx(value, abs=1e-11)
+            assert form.min() - 1e-12 <= value <= form.max() + 1e-12
+    assert volume == pytest.approx(np.prod([a.high - a.low for a in axes]))
+    assert amplification(axes) >= 1.0
+
+
+def test_what_is_proven_when_time_is_up_still_holds():
+    rng = np.random.default_rng(4)
+    axes = tuple(Axis.of(-np.pi, np.pi, True) for _ in range(3))
+    wave = rng.normal(size=(5, 5, 5))
+    wave[0, 0, 0] = 2.0 * np.abs(wave).sum()
+    exact = maximise(axes, wave, 0.0, tolerance=1e-7)
+    asked = itertools.count()
+    early = maximise(axes, wave, 0.0, tolerance=1e-7, stop=lambda: next(asked) > 2)
+    assert early.late and not exact.late
+    assert early.upper >= exact.found
+    assert exact.upper <= exact.found * (1 + 1e-6)
+    value = wave
+    assert exact.where is not None
+    for t, axis in zip(exact.where, axes, strict=True):
+        value = np.tensordot(axis.harmonics(np.array([t]))[0], value, 1)
+    assert value == pytest.approx(exact.found, rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_any_positive_slope_gives_a_bound(seed):
+    """The closed forms of c: c Ψ(M) ≤ tr(G M), with equality at the M that G is the slope of."""
+    rng = np.random.default_rng(seed)
+    size = 5
+
+    def positive():
+        a = rng.normal(size=(size, size + 1))
+        return a @ a.T
+
+    weight = positive()
+    padded = np.zeros((size, size))
+    padded[:3, :3] = weight[:3, :3]
+    criteria = [
+        Accuracy(weight),
+        Determinant(),
+        PowerMean(8.0, smallest=True),
+        Eliminating(Accuracy(weight[:3, :3]), (0, 1, 2), (3, 4)),
+    ]
+    for criterion in criteria:
+        root = square_root(positive())
+        scale = _scale(criterion, root)
+        for _ in range(20):
+            matrix = positive()
+            assert scale * criterion.exact(matrix) <= np.sum(root @ root.T * matrix) * (1 + SLACK)
+        matrix = positive()
+        own = square_root(criterion.supporting_slope(matrix))
+        assert _scale(criterion, own) == pytest.approx(1.0, rel=1e-6)
+
+
+# ── what the planner makes of it ─────────────────────────────────────────────────────────────────────
+
+
+def test_a_maximum_that_search_missed_is_found_and_repaired():
+    """Handed a slope whose largest sensitivity is hidden from it, the proof is loose, then close again."""
+    problem = PlanProblem(Robot.load("kuka_kr270"), TEST_POSE, 4)
+    space = plan_space(problem)
+    asked = relaxed_problem(space)
+    rng = np.random.default_rng(0)
+    good = relaxed_design(asked, problem.test_pose_array, rng)
+    matrix = 4.0 * space.single.at(random_configurations(space.robot, 64, 3)).mean(axis=0)
+    wrong = dataclasses.replace(good, slope=asked.criterion.supporting_slope(matrix))
+    bounded, proof = prove_bound(asked, wrong, rng)
+    assert proof.status == "proven"
+    assert bounded.bound == pytest.approx(good.bound, rel=5e-3)
+
+
+def test_noise_without_a_polynomial_stays_numerical_and_says_so():
+    robot = Robot.load("planar_2r")
+    noise = LaserTracker(station=[4.0, 0.0, 1.0])
+    found = plan(PlanProblem(robot, [0.3, 0.5], 4, noise=noise, starts=4), prove=True)
+    assert found.bound == "numerical"
+    assert "isotropic" in found.message
+
+
+def test_pools_are_proven_by_looking_at_every_candidate():
+    robot = Robot.load("kuka_kr270")
+    pool = random_configurations(robot, 60, 2)
+    found = plan(PlanProblem(robot, TEST_POSE, 5, candidates=pool), prove=True)
+    assert found.bound == "proven"
+    assert "candidate" in found.message
+    assert found.lower_bound <= found.predicted_accuracy * (1 + SLACK)
+
+
+def test_without_prove_nothing_claims_to_be_proven():
+    found = plan(PlanProblem(Robot.load("planar_2r"), [0.3, 0.5], 4, starts=4))
+    assert found.bound == "numerical"
+    assert "proven" not in found.message

@@ -1,0 +1,159 @@
+"""Choosing from a pool: against brute force, with and without repeats, and what cannot be chosen."""
+
+from __future__ import annotations
+
+from itertools import combinations, combinations_with_replacement
+
+import numpy as np
+import pytest
+from robots import SHARED_DATA, random_configurations
+
+from calib_planner import Robot
+from calib_planner.errors import InfeasibleError
+from calib_planner.planning import PlanProblem, plan
+from calib_planner.planning.bound import relax_pool
+from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
+from calib_planner.planning.search.exchange import PoolProblem, RunningDeterminant, choose, pool_rows
+
+P = 4
+CRITERIA = {
+    "d": Determinant(),
+    "d nuisance": Eliminating(Determinant(), (0, 1, 2), (3,)),
+    "a": Accuracy(np.eye(P) / P),
+    "a nuisance": Eliminating(Accuracy(np.eye(2)), (0, 1), (2, 3)),
+    "d_star": DiagonalDeterminant(),
+    "e": PowerMean(8.0, smallest=True),
+}
+
+
+def pool(seed: int, count: int = 11, k: int = 3) -> np.ndarray:
+    """(count, k, P) rows of very different sizes and units."""
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal((count, k, P)) * [1.0, 1e3, 1e-2, 5.0] * rng.uniform(0.2, 2, (count, 1, 1))
+
+
+def worth(problem: PoolProblem, rows: tuple[int, ...]) -> float:
+    """Ψ of a choice from its definition."""
+    matrix = problem.prior + sum(problem.rows[i].T @ problem.rows[i] for i in rows)
+    if np.linalg.cond(matrix / np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))) > 1e12:
+        return 0.0
+    return float(problem.criterion.worth_and_slope(matrix[None])[0][0])
+
+
+def brute_force(problem: PoolProblem) -> float:
+    """The best worth of all choices there are, in the form that the search maximises."""
+    every = combinations_with_replacement if problem.repeat else combinations
+    return max(worth(problem, c) for c in every(range(len(problem.rows)), problem.size))
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+@pytest.mark.parametrize("repeat", [False, True])
+def test_small_pools_against_every_subset(name: str, repeat: bool) -> None:
+    for seed in range(6):
+        problem = PoolProblem(pool(seed), CRITERIA[name], np.zeros((P, P)), 4, repeat)
+        found = choose(problem, np.random.default_rng(0))
+        best = brute_force(problem)
+        assert np.exp(found.log_worth) == pytest.approx(worth(problem, tuple(found.rows)), rel=1e-6)
+        assert np.exp(found.log_worth) <= best * (1 + 1e-6)
+        assert np.exp(found.log_worth) >= best * (1 - 1e-9 if name.startswith("d ") or name == "d" else 0.97)
+        if not repeat:
+            assert len(set(found.rows.tolist())) == 4
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+@pytest.mark.parametrize("repeat", [False, True])
+def test_no_choice_beats_the_bound(name: str, repeat: bool) -> None:
+    for seed in range(10):
+        problem = PoolProblem(pool(seed), CRITERIA[name], np.diag([1.0, 1.0, 1e-4, 1.0]), 3, repeat)
+        relaxed = relax_pool(problem.rows, problem.criterion, problem.prior, 3, None if repeat else 3)
+        found = choose(problem, np.random.default_rng(0))
+        rows = problem.rows[found.rows].reshape(-1, P)
+        assert problem.criterion.exact(problem.prior + rows.T @ rows) <= relaxed.bound * (1 + 1e-9)
+        if name != "e":  # which is searched through a smooth, larger one
+            assert brute_force(problem) <= relaxed.bound * (1 + 1e-9)
+        assert relaxed.weights.sum() == pytest.approx(1.0)
+
+
+def test_bound_of_distinct_rows_is_the_tighter_one() -> None:
+    rows = pool(1, 12)
+    rows[0] *= 30.0  # one outstanding candidate, which may be taken once
+    free = relax_pool(rows, Determinant(), np.zeros((P, P)), 6, None)
+    once = relax_pool(rows, Determinant(), np.zeros((P, P)), 6, 6)
+    assert once.bound < 0.9 * free.bound
+
+
+@pytest.mark.parametrize("k", [2, 3, 6])
+def test_running_determinant_is_the_determinant(k: int) -> None:
+    rows = pool(3, 20, k)
+    prior = np.diag([1.0, 2.0, 1e-4, 0.5])
+    state = RunningDeterminant(pool_rows(rows, prior, 5), np.array([1, 4, 6]))
+    chosen = [1, 4, 6]
+    for row, sign in [(3, 1), (4, -1), (9, 1), (9, 1), (1, -1)]:
+        state.change(row, sign)
+        chosen = [*chosen, row] if sign > 0 else [c for c in chosen if c != row]
+    matrix = prior + sum(rows[i].T @ rows[i] for i in chosen)
+    exact = np.linalg.slogdet(matrix)[1]
+    assert state.log_det == pytest.approx(exact, abs=1e-6)
+    gains = [np.linalg.slogdet(matrix + r.T @ r)[1] - exact for r in rows]
+    np.testing.assert_allclose(state.gains(), gains, atol=1e-6)
+
+
+def test_exactly_determined_choice() -> None:
+    rows = np.random.default_rng(5).standard_normal((12, 2, P))
+    problem = PoolProblem(rows, Determinant(), np.zeros((P, P)), 2)
+    assert np.exp(choose(problem, np.random.default_rng(0)).log_worth) == pytest.approx(brute_force(problem))
+
+
+@pytest.mark.parametrize("criterion", [Determinant(), Accuracy(np.eye(P))])
+def test_rank_deficient_pool_names_the_combination(criterion: Determinant | Accuracy) -> None:
+    rows = pool(0)
+    rows[:, :, 2] = 2.0 * rows[:, :, 1]
+    problem = PoolProblem(rows, criterion, np.zeros((P, P)), 4, names=("a", "b", "c", "d"))
+    with pytest.raises(InfeasibleError, match=r"1·c - 2·b") as caught:
+        choose(problem, np.random.default_rng(0))
+    assert caught.value.constraint == "candidates"
+    informed = PoolProblem(rows, criterion, np.diag([0.0, 0.0, 1.0, 0.0]), 4)
+    assert np.isfinite(choose(informed, np.random.default_rng(0)).log_worth)
+
+
+def test_too_few_candidates() -> None:
+    with pytest.raises(InfeasibleError, match="3 feasible rows"):
+        choose(PoolProblem(pool(0, 3), Determinant(), np.zeros((P, P)), 4), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("criterion", ["test_pose", "worst_pose", "d", "d_star", "a", "e", "o5", "o2", "o4"])
+def test_plans_from_candidates(criterion: str) -> None:
+    robot = Robot.load("kuka_kr270")
+    candidates = random_configurations(robot, 150, 3)
+    test_poses = random_configurations(robot, 2, 4)
+    problem = PlanProblem(robot, test_poses, 6, criterion=criterion, candidates=candidates, seed=2)
+    found, again = plan(problem), plan(problem)
+    np.testing.assert_array_equal(found.configurations, again.configurations)
+    rows = [int(np.flatnonzero((candidates == q).all(axis=1))[0]) for q in found.configurations]
+    assert len(set(rows)) == 6
+    if criterion in ("o2", "o4"):
+        assert found.bound == "none"
+    else:
+        assert 0.5 < found.efficiency <= 1.0
+
+
+def test_repeats_only_when_allowed() -> None:
+    robot = Robot.load("planar_2r")
+    candidates = np.array([[0.0, 0.8], [0.5, 0.1], [-0.4, 0.2], [1.0, -0.8], [1.5, 0.0], [0.1, 0.05]])
+    once = plan(PlanProblem(robot, [[0.0, 0.8]], 6, candidates=candidates))
+    again = plan(PlanProblem(robot, [[0.0, 0.8]], 6, candidates=candidates, repeat_candidates=True))
+    assert len(np.unique(once.configurations, axis=0)) == 6
+    assert len(np.unique(again.configurations, axis=0)) < 6
+    assert again.predicted_accuracy < once.predicted_accuracy
+
+
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="no measured data here")
+def test_pool_that_sees_less_than_the_robot_could() -> None:
+    robot = Robot.load(SHARED_DATA / "ur10_tracker" / "ur10.urdf").with_targets([[0.05, 0.02, 0.1]])
+    robot = robot.with_parameters("full", ("base", "tool"))
+    candidates = random_configurations(robot, 200)
+    candidates[:, 2:] = candidates[0, 2:]  # only two joints move
+    found = plan(PlanProblem(robot, None, 12, criterion="d", candidates=candidates))
+    assert found.status == "ok"
+    assert len(found.unidentifiable) > 24  # a robot that moves has 24 combinations, this pool sees fewer
+    assert "held at nominal" in found.message

@@ -1,0 +1,130 @@
+"""Self-collision by Pinocchio and Coal, on an arm of boxes, balls and cylinders whose collisions are known."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+
+import numpy as np
+import pytest
+
+from calib_planner import FileFormatError, InputError, PlanProblem, Robot, plan
+from calib_planner.planning import SelfCollision
+from calib_planner.planning.constraints.self_collision import MissingExtraError
+
+pin = pytest.importorskip("pinocchio")
+
+
+def shape(geometry, xyz="0 0 0", rpy="0 0 0"):
+    return f'<collision><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{geometry}</geometry></collision>'
+
+
+BALL = '<sphere radius="0.1"/>'
+ARM = f"""<robot name="arm">
+  <link name="base">{shape('<box size="0.2 0.2 0.2"/>')}</link>
+  <link name="upper">{shape('<cylinder radius="0.05" length="0.8"/>', "0.5 0 0", "0 1.5707963 0")}</link>
+  <link name="lower">{shape('<cylinder radius="0.05" length="0.7"/>', "0.45 0 0", "0 1.5707963 0")}</link>
+  <link name="tip">{shape(BALL)}</link><link name="finger">{shape('<sphere radius="0.02"/>', "0.15 0 0")}</link>
+  <joint name="q1" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="q2" type="continuous"><origin xyz="1 0 0"/><parent link="upper"/><child link="lower"/>
+    <axis xyz="0 0 1"/></joint>
+  <joint name="flange" type="fixed"><origin xyz="1 0 0"/><parent link="lower"/><child link="tip"/></joint>
+  <joint name="grip" type="prismatic"><parent link="tip"/><child link="finger"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="0.1" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """(robot up to the link tip, constraint)."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM)
+    return Robot.load(path, tip_link="tip"), SelfCollision(path)
+
+
+def test_against_the_plane_by_hand(arm):
+    """Everything is widest at z = 0, so that bodies touch exactly where their sections there do: a square, a
+    rectangle (the lower arm), two circles. What can touch: base with lower arm, ball and finger; upper arm
+    with finger. Other pairs are neighbours."""
+    robot, free = arm
+    q = np.random.default_rng(0).uniform([-3, 2.4], [3, 2 * np.pi - 2.4], (600, 2))
+    q[:, 1] -= 2 * np.pi * (q[:, 1] > np.pi)
+    elbow = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
+    along = np.stack([np.cos(q.sum(axis=1)), np.sin(q.sum(axis=1))], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    ball, finger = elbow + along, elbow + 1.15 * along
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0.1, 0.8, 141), np.linspace(-0.05, 0.05, 21)))
+    arm_points = elbow[:, None] + u[:, None] * along[:, None] + v[:, None] * across[:, None]
+    turned = np.stack([(finger * elbow).sum(axis=1), elbow[:, 0] * finger[:, 1] - elbow[:, 1] * finger[:, 0]], 1)
+    gaps = [
+        outside(arm_points, [-0.1, -0.1], [0.1, 0.1]).min(axis=1),
+        outside(ball, [-0.1, -0.1], [0.1, 0.1]) - 0.1,
+        outside(finger, [-0.1, -0.1], [0.1, 0.1]) - 0.02,
+        outside(turned, [0.1, -0.05], [0.9, 0.05]) - 0.02,
+    ]
+    gap = np.min(gaps, axis=0)
+    sure = (gap > 0.006) | (gap <= 0)  # the grid of the rectangle is 5 mm wide
+    np.testing.assert_array_equal(free.allowed(robot, q)[sure], gap[sure] > 0)
+    assert sure.mean() > 0.9 and 0.1 < (gap > 0).mean() < 0.9
+
+
+def outside(points, low, high):
+    """Distance of points (…, 2) from a rectangle, 0 inside."""
+    return np.linalg.norm(np.maximum(0, np.maximum(low - points, points - high)), axis=-1)
+
+
+def test_neighbours_and_stretched_arm(arm):
+    robot, free = arm
+    assert free.allowed(robot, np.array([[0, 0], [0, 0.3], [0, np.pi], [1.0, -np.pi]])).tolist() == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_joints_in_another_order_are_matched_by_name(arm, tmp_path):
+    robot, free = arm
+    q = np.array([[0.4, np.pi], [np.pi - 0.2, 0.4]])
+    assert free.allowed(robot, q).tolist() == [False, True]
+    other = tmp_path / "other.urdf"
+    other.write_text(ARM.replace('"q2"', '"elbow"'))
+    with pytest.raises(InputError, match=r"joint q2.*q1, elbow"):
+        SelfCollision(other).allowed(robot, q)
+
+
+def test_plans_avoid_collisions(arm):
+    robot, free = arm
+    found = plan(PlanProblem(robot.with_parameters("offsets"), [0.3, 0.5], 3, constraints=(free,), starts=4))
+    assert SelfCollision(free.urdf_path).allowed(robot, found.configurations).all()
+
+
+def test_it_travels_to_other_processes(arm):
+    robot, free = arm
+    q = np.array([[0, np.pi], [0, 0.0]])
+    before = free.allowed(robot, q)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(free)).allowed(robot, q), before)
+
+
+def test_files_that_cannot_be_used(arm, tmp_path):
+    robot, _ = arm
+    q = np.zeros((1, 2))
+    with pytest.raises(FileFormatError, match="no such file"):
+        SelfCollision(tmp_path / "none.urdf").allowed(robot, q)
+    bare = tmp_path / "bare.urdf"
+    bare.write_text(ARM.replace("collision>", "visual>"))
+    with pytest.raises(FileFormatError, match="not neighbours"):
+        SelfCollision(bare).allowed(robot, q)
+    mesh = tmp_path / "mesh.urdf"
+    mesh.write_text(ARM.replace(BALL, '<mesh filename="package://no/where.stl"/>'))
+    with pytest.raises(FileFormatError, match=r"mesh\.urdf"):
+        SelfCollision(mesh).allowed(robot, q)
+
+
+def test_without_pinocchio_the_extra_is_named(arm, monkeypatch):
+    robot, free = arm
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'calib_planner\[collision\]'") as caught:
+        free.allowed(robot, np.zeros((1, 2)))
+    assert caught.value.extra == "collision"
