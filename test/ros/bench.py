@@ -15,6 +15,7 @@ from typing import Any
 import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
@@ -39,6 +40,8 @@ class Bench:
         self.client = Node("test_client", context=self.context)
         self.nodes: list[Node] = []
         self.actions: list[ActionClient] = []
+        self._callers: dict[str, Any] = {}
+        self._action_clients: dict[str, ActionClient] = {}
         self.stopping = False
         self._spinning: list[tuple[Executor, threading.Thread]] = []
         self._spin(self.client, 1)
@@ -101,19 +104,18 @@ class Bench:
         return future.result()
 
     def call(self, kind: Any, name: str, request: Any, seconds: float = 10.0, attempts: int = 3) -> Any:
-        client = self.client.create_client(kind, name)
-        try:
-            self.wait(client.service_is_ready)
-            for attempt in range(attempts):
-                future = client.call_async(request)
-                try:
-                    return self.future(future, seconds)
-                except AssertionError:
-                    client.remove_pending_request(future)
-                    if attempt == attempts - 1:
-                        raise
-        finally:
-            self.client.destroy_client(client)
+        client = self._callers.get(name)
+        if client is None:
+            client = self._callers[name] = self.client.create_client(kind, name)
+        self.wait(client.service_is_ready)
+        for attempt in range(attempts):
+            future = client.call_async(request)
+            try:
+                return self.future(future, seconds)
+            except AssertionError:
+                client.remove_pending_request(future)
+                if attempt == attempts - 1:
+                    raise
 
     def change_state(self, name: str, transition: int, label: str = "") -> bool:
         """Whether the node ``name`` made the transition; not asked twice, since it can be made only once."""
@@ -126,8 +128,11 @@ class Bench:
             return bool(node.state != before)
 
     def action(self, kind: Any, name: str) -> ActionClient:
-        client = ActionClient(self.client, kind, name)
-        self.actions.append(client)
+        """The client of an action, one for all: a new one may be answered before discovery has matched it."""
+        client = self._action_clients.get(name)
+        if client is None:
+            client = self._action_clients[name] = ActionClient(self.client, kind, name)
+            self.actions.append(client)
         self.wait(client.server_is_ready)
         return client
 
@@ -142,6 +147,30 @@ class Bench:
             assert handle.accepted
             return handle
         raise AssertionError("goal not answered")
+
+    def said(self, logs: list[Log], node: Node, send: Callable[[], None], *words: str) -> str:
+        """Send until ``node`` warns on its log in these words; the line.
+
+        Args:
+            logs: What is heard on ``/rosout``.
+        """
+        known = len(logs)
+        for context in list(node.get_logger().contexts.values()):
+            context["throttle_last_logged"] = 0  # or a line that is said once a second is not said this time
+
+        def line() -> str:
+            mine = (m.msg for m in logs[known:] if m.name == node.get_name() and m.level >= 30)
+            return next((m for m in mine if all(word in m for word in words)), "")
+
+        for _ in range(10):
+            send()
+            try:
+                self.wait(line, 2.0)
+            except AssertionError:
+                continue
+            assert len(line()) < 3000
+            return line()
+        raise AssertionError(f"{node.get_name()} did not say {words}: {[m.msg[:200] for m in logs[known:]][-5:]}")
 
     def hear(self, kind: Any, topic: str, qos: QoSProfile) -> list[Any]:
         """A list that grows with the messages of a topic."""

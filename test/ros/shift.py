@@ -81,7 +81,7 @@ class Shift:
         """Messages that the node took."""
         return sum(w.messages for w in self.node._intake.streams)
 
-    def send(self, publisher: Any, message: Any, ahead: int = 10) -> None:
+    def send(self, publisher: Any, message: Any, ahead: int = 100) -> None:
         """Publish, and wait until all but the last ``ahead`` messages were taken."""
         publisher.publish(message)
         self.sent += 1

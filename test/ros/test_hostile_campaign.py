@@ -7,7 +7,6 @@ where it stood, and nothing was written elsewhere; at the end it is measured to 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -87,16 +86,8 @@ class Attack:
         return Measurement(**(usual | changes))
 
     def refused(self, send: Callable[[], None], *words: str) -> None:
-        """Send until the node says on the log why it refuses; it does so at most once a second."""
-        known, deadline = len(self.logs), time.monotonic() + 20.0
-        while time.monotonic() < deadline:
-            send()
-            time.sleep(0.3)
-            for line in self.logs[known:]:
-                if line.name == NAME and line.level >= 30 and all(word in line.msg for word in words):
-                    assert len(line.msg) < 3000 and "0123" not in line.msg
-                    return
-        raise AssertionError(f"did not say {words}: {[m.msg[:200] for m in self.logs[known:]][-5:]}")
+        """The node says on the log why it refuses."""
+        assert "0123" not in self.bench.said(self.logs, self.node, send, *words)
 
     def watch(self) -> None:
         """Keep what the node refuses of measurements, which is more than it says."""

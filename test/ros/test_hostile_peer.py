@@ -6,7 +6,6 @@ of them answers an ordinary request, and at the end a plan is still measured and
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner import Plan, Robot
+from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.planner import PlannerNode
@@ -61,9 +61,10 @@ class Cell:
         self.outside.mkdir()
         (self.outside / "secret.txt").write_text("0123-secret")
         robot = {"robot": "planar_2r"}
-        self.simulator = bench.start(SimulatorNode, joint_speed=100.0, dwell=0.9, **robot)
+        self.simulator = bench.start(SimulatorNode, joint_speed=100.0, dwell=0.4, **robot)
         kept = {"store_folder": str(folder / "store"), "save_folder": str(folder / "saved")}
-        self.identifier = bench.start(IdentifierNode, **robot, **kept)
+        short = {"settle": 0.05, "duration": 0.2, "samples": 10}
+        self.identifier = bench.start(IdentifierNode, **robot, **kept, **short)
         self.planner = bench.start(PlannerNode, starts=4, time_limit=5.0, **robot)
         self.logs = bench.hear(Log, "/rosout", QoSProfile(depth=1000))
         self.measurements = bench.hear(Measurement, f"{IDENTIFIER}/measurements", EVENTS)
@@ -83,17 +84,9 @@ class Cell:
     def ask(self, **changes: Any) -> PlanService.Response:
         return self.bench.call(PlanService, f"{PLANNER}/request_plan", self.request(**changes), 30.0)
 
-    def refused(self, node: str, send: Callable[[], None], *words: str) -> str:
-        """Send until the node says on the log why it refuses (it does not say so every time); its words."""
-        known, deadline = len(self.logs), time.monotonic() + 20.0
-        while time.monotonic() < deadline:
-            send()
-            time.sleep(0.3)
-            for line in self.logs[known:]:
-                if line.name == node and line.level >= 30 and all(word in line.msg for word in words):
-                    assert len(line.msg) < 3000
-                    return str(line.msg)
-        raise AssertionError(f"{node} did not say {words}: {[m.msg[:200] for m in self.logs[known:]][-5:]}")
+    def refused(self, node: ManagedNode[Any], send: Callable[[], None], *words: str) -> str:
+        """What the node says on the log why it refuses."""
+        return self.bench.said(self.logs, node, send, *words)
 
     def check(self) -> None:
         """All nodes are at work and answer; nothing was written elsewhere."""
@@ -198,7 +191,7 @@ def test_plans(cell: Cell, planned: Plan, case: str) -> None:
     message = plan_to_message(planned, "hostile", 0, "base")
     for name, value in PLANS[case].items():
         setattr(message, name, value)
-    assert cell.refused(IDENTIFIER, lambda: cell.plans.publish(message), "refused")
+    assert cell.refused(cell.identifier, lambda: cell.plans.publish(message), "refused")
     assert all(e.plan_id != "hostile" for e in cell.estimates)
     goal = ExecutePlan.Goal(plan=message)
     client = cell.bench.action(ExecutePlan, f"{SIMULATOR}/execute_plan")
@@ -279,7 +272,7 @@ def test_descriptions(cell: Cell, case: str) -> None:
     before = cell.planner._source.model, cell.identifier._campaign
     said = [
         cell.refused(node, lambda: cell.descriptions.publish(String(data=text)), "refused")
-        for node in (PLANNER, IDENTIFIER)
+        for node in (cell.planner, cell.identifier)
     ]
     assert all("0123" not in words for words in said)
     assert cell.identifier._campaign is before[1] and cell.planner._source.model is before[0]

@@ -56,8 +56,8 @@ class ArmShift(Shift):
                 stamp = self.stamp + i * (10**7 if not away else NANO // 2)
                 state = JointState(name=names, position=(np.asarray(q) + away).tolist())
                 state.header.stamp = stamp_message(stamp)
-                self.send(self.joints, state, 0)
-                self.send(self.points, point_message(point, stamp, "laser"), 0)
+                self.send(self.joints, state)
+                self.send(self.points, point_message(point, stamp, "laser"))
             self.stamp += 2 * NANO
         self.bench.wait(lambda: len(self.measurements) > count)
         return self.measurements[-1]

@@ -113,7 +113,7 @@ def test_a_frame_that_changes_within_a_standstill_is_not_averaged(
     shift.rest(planned.configurations[0])
     frames, send = chain(["laser"] * 15, repeat("elsewhere")), shift.send
 
-    def framed(publisher: Any, message: Any, ahead: int = 10) -> None:
+    def framed(publisher: Any, message: Any, ahead: int = 100) -> None:
         if isinstance(message, PointStamped):
             message.header.frame_id = next(frames)
         send(publisher, message, ahead)
