@@ -44,6 +44,12 @@ class Case:
         """Whether it needs measured data of real robots."""
         return any(needs_real(word) for word in self.words)
 
+    @property
+    def searched(self) -> bool:
+        """Whether the answer follows from a search for plans."""
+        words = self.words
+        return words[0] in SEARCHING or any(MADE.get(word, "").startswith("plan ") for word in words)
+
 
 # ── files that cases read ────────────────────────────────────────────────────────────────────────────
 
@@ -186,6 +192,7 @@ COMMANDS = (
     "demo",
     "reproduce",
 )
+SEARCHING = ("plan", "campaign", "compare", "demo", "reproduce")
 IRB = "--robot real/irb120_tracker/irb120.urdf"
 UR10 = "--robot real/ur10_tracker/ur10.urdf"
 SHEET = ("plan_sheet.html", "plan_sheet.csv", "plan_sheet.yaml", "trajectory.yaml")
