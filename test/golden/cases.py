@@ -241,7 +241,7 @@ def _plans() -> list[Case]:
         Case("plan_prove_offsets", f"{planar} --parameters offsets --configurations 2 --repetitions 2 --prove"),
         Case("plan_for_accuracy", f"{planar} --accuracy 3e-5 --starts 4"),
         Case("plan_of_measurements", f"{planar} --measurements 8 --starts 4"),
-        Case("plan_of_the_paper", f"{kuka} --configurations 3 --starts 4 --general-weight 0 --sigma 1e-4"),
+        Case("plan_of_the_paper", f"{small} {two} --general-weight 0 --sigma 1e-4"),
         Case("plan_configuration_sigma", f"{planar} --measurements 6 --starts 4 --configuration-sigma 2e-5"),
         Case("plan_named", f"{kuka} --parameters d1,q2,q3 --configurations 2 --starts 4"),
         Case("plan_lengths", f"{kuka} --parameters lengths --configurations 2 --starts 4"),

@@ -166,7 +166,7 @@ def answer(case: Case, inputs: Inputs, folder: Path) -> dict[str, Any]:
     if status:
         found |= {"output": out, "message": err.strip()}
     elif "--help" in case.words:
-        found["options"] = options(out)
+        found["options"] = dict.fromkeys(options(out), True)
     elif case.tables:
         found["numbers"] = decimals(out)
     else:
