@@ -12,11 +12,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.io import write_estimate, write_measurements, write_plan, write_text
-from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, error_variance, plain, plan
+from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, error_variance, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations

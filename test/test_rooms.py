@@ -27,7 +27,7 @@ PAPER = ROOT / "paper" / "calib_planner_paper"
 
 # ── the rooms ────────────────────────────────────────────────────────────────────────────────────────
 
-GROUND = ("errors", "arrays", "units", "measurements")
+GROUND = ("doors", "errors", "arrays", "units", "measurements")
 """Single files that every room may use; each uses only those before it."""
 ROOMS: dict[str, str] = {
     "robot": "",
@@ -45,7 +45,7 @@ ROOMS: dict[str, str] = {
     "ros": "robot tracker acquisition planning identification campaign simulation io report demo",
 }
 """Room → the rooms that it may use besides ``GROUND``, in the order of the house: each only rooms above it."""
-FRONT = {"": "errors measurements planning identification io", "__main__": "cli"}
+FRONT = {"": "doors errors measurements planning identification io", "__main__": "cli"}
 """The package's own door, which resolves names when they are first used, and ``python -m calib_planner``."""
 PAPER_USES = "robot tracker planning identification simulation io cli"
 WITHOUT_A_DOOR = ("ros",)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib_planner.arrays import FloatArray, check_count, check_number, frozen
+from calib_planner.arrays import FloatArray, check_count, check_number, frozen, plain
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import Estimate, IdentificationProblem, Verdict
 from calib_planner.measurements import Measurements
-from calib_planner.planning import Constraint, PlanProblem, plain
+from calib_planner.planning import Constraint, PlanProblem
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
 

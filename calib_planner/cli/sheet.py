@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray, check_number
+from calib_planner.arrays import FloatArray, check_number, plain
 from calib_planner.cli.arguments import Commands, add_command, add_robot, load_robot, numbers
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import FileFormatError, InputError
@@ -27,7 +27,7 @@ from calib_planner.io import (
     write_sheet_yaml,
     write_trajectory,
 )
-from calib_planner.planning import DWELL, Pace, PlanSheet, plain, plan_sheet, usual_pace
+from calib_planner.planning import DWELL, Pace, PlanSheet, plan_sheet, usual_pace
 from calib_planner.report import write_sheet_page
 from calib_planner.robot import Robot
 from calib_planner.units import duration, length, signed

@@ -22,7 +22,7 @@ from calib_planner.planning.information import (
     plan_space,
     smallest_size,
 )
-from calib_planner.planning.plan import Plan, plain
+from calib_planner.planning.plan import Plan
 from calib_planner.planning.planner import Progress, plan
 from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, check_count
+from calib_planner.arrays import FloatArray, check_count, plain
 from calib_planner.errors import InputError
 from calib_planner.planning.information import PlanSpace, plan_space
-from calib_planner.planning.plan import Plan, plain
+from calib_planner.planning.plan import Plan
 from calib_planner.planning.planner import plan
 from calib_planner.planning.problem import PlanProblem
 

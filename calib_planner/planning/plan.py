@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, IntArray, frozen
+from calib_planner.arrays import FloatArray, IntArray, frozen, plain
 
 STATUS = {
     "ok": "The plan is complete.",
@@ -94,18 +94,3 @@ class Plan:
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
         return plain({name: getattr(self, name) for name in self.__dataclass_fields__})
-
-
-def plain(value: Any) -> Any:
-    """Arrays to lists, NumPy numbers to Python's, non-finite numbers to ``None``, recursively."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

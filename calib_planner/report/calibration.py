@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import Estimate, IdentificationProblem, fit_placement, start_robot
 from calib_planner.measurements import Measurements
-from calib_planner.planning import plain
 from calib_planner.report.provenance import Provenance
 from calib_planner.report.scene import Scene, scene_of
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, frozen
-from calib_planner.planning import Plan, PlanProblem, WorkspaceBox, plain, plan, plan_space, random_accuracies
+from calib_planner.arrays import FloatArray, frozen, plain
+from calib_planner.planning import Plan, PlanProblem, WorkspaceBox, plan, plan_space, random_accuracies
 from calib_planner.robot import Robot
 from calib_planner_paper import printed
 from calib_planner_paper.calibrations import Calibrations, Laboratory, calibrate, error_covariance
