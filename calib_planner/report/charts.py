@@ -22,7 +22,7 @@ from calib_planner.identification import FEWEST, Estimate, Validation
 from calib_planner.report.calibration import CalibrationReport
 from calib_planner.report.render import Drawing, Shape, shape
 from calib_planner.report.scene import REJECTED, SUSPECT, USED, point_states, thinned
-from calib_planner.units import length
+from calib_planner.units import joint_factor, joint_unit, length
 
 MOST_DOTS = 1200
 BINS = 12
@@ -78,19 +78,29 @@ def _round_step(value: float) -> float:
 
 @dataclass(frozen=True)
 class Chart:
-    """A frame of ``width`` × ``height`` with two axes; ``y`` starts at the bottom, labels hold the unit."""
+    """A frame of ``width`` × ``height`` with the usual margins and two axes, for values x and y within ``across``
+    and ``up``; ``labels`` are those of x and of y with the unit, and the title."""
 
-    x: Axis
-    y: Axis
     width: float
     height: float
-    x_label: str
-    y_label: str
-    title: str
+    across: tuple[float, float]
+    up: tuple[float, float]
+    labels: tuple[str, str, str]
+    left: float = 44.0
+    log: tuple[bool, bool] = (False, False)
+
+    @property
+    def x(self) -> Axis:
+        return Axis(*self.across, self.left, self.width - 8.0, self.log[0])
+
+    @property
+    def y(self) -> Axis:
+        """From the bottom upwards."""
+        return Axis(*self.up, self.height - 38.0, 22.0, self.log[1])
 
     def drawing(self, *parts: Shape) -> Drawing:
         """The frame with ``parts`` in it."""
-        return Drawing("chart", f"{self.width:g} {self.height:g}", self.title, [*self._grid(), *parts])
+        return Drawing("chart", f"{self.width:g} {self.height:g}", self.labels[2], [*self._grid(), *parts])
 
     def dots(self, name: str, x: ArrayLike, y: ArrayLike) -> Shape:
         """One path of dots of class ``name``; values that are not finite are left out."""
@@ -130,23 +140,8 @@ class Chart:
             at = float(self.y(value))
             yield shape("path", class_="grid", d=f"M{left} {_n(at)}H{right}")
             yield _label(self.x.start - 5, at + 4, "end", _plain(value))
-        yield _label((self.x.start + self.x.end) / 2, self.height - 5, "middle", self.x_label)
-        yield _label(2, 12, "start", self.y_label)
-
-
-def framed(
-    width: float,
-    height: float,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    labels: tuple[str, str, str],
-    *,
-    left: float = 44.0,
-    log: tuple[bool, bool] = (False, False),
-) -> Chart:
-    """A chart of the usual margins; ``labels`` are x, y and title."""
-    across, up = Axis(*x, left, width - 8.0, log[0]), Axis(*y, height - 38.0, 22.0, log[1])
-    return Chart(across, up, width, height, *labels)
+        yield _label((self.x.start + self.x.end) / 2, self.height - 5, "middle", self.labels[0])
+        yield _label(2, 12, "start", self.labels[1])
 
 
 def _label(x: float, y: float, anchor: str, words: str, name: str = "axis-text") -> Shape:
@@ -173,11 +168,6 @@ def _log_range(values: FloatArray) -> tuple[float, float]:
     return float(min(low, middle / np.sqrt(10))), float(max(high, middle * np.sqrt(10)))
 
 
-def _padded(values: FloatArray) -> tuple[float, float]:
-    pad = 0.03 * float(np.ptp(values)) or 1.0
-    return float(values.min()) - pad, float(values.max()) + pad
-
-
 # ── before and after, predicted and achieved ─────────────────────────────────────────────────────────
 
 
@@ -195,8 +185,8 @@ def accuracy_charts(estimate: Estimate) -> tuple[Drawing, Drawing | None]:
     required = estimate.required_accuracy if np.isfinite(estimate.required_accuracy) else None
     sets = validation_sets(estimate)
     means = [Row("points of the fit", estimate.residual_before.mean, estimate.residual_after.mean)]
-    means += [Row(name, v.before_mean, v.mean) for name, v in sets]
-    promised = [Row(f"{name}: {length(v.rms)}", None, v.rms, (v.predicted_rms,)) for name, v in sets]
+    means += [Row(name, v.before_mean, v.mean) for name, _, v in sets]
+    promised = [Row(f"{name}: {length(v.rms)}", None, v.rms, (v.predicted_rms,)) for name, _, v in sets]
     per = estimate.predicted_accuracy_per_test_pose
     finite = per[np.isfinite(per)]
     if finite.size:
@@ -206,14 +196,11 @@ def accuracy_charts(estimate: Estimate) -> tuple[Drawing, Drawing | None]:
     return first, _compared(promised, "achieved and predicted error", required) if promised else None
 
 
-def validation_sets(estimate: Estimate) -> list[tuple[str, Validation]]:
-    """Name and statistics of each validation there is."""
-    sets: list[tuple[str, Validation]] = []
-    if estimate.validation is not None:
-        sets.append(("held-out points", estimate.validation))
-    if estimate.cross_validation is not None:
-        sets.append((f"left out in turn, {estimate.cross_validation.folds} folds", estimate.cross_validation))
-    return sets
+def validation_sets(estimate: Estimate) -> list[tuple[str, str, Validation]]:
+    """Name, attribute of the estimate and statistics of each validation there is."""
+    held_out, in_turn = estimate.validation, estimate.cross_validation
+    sets = [("held-out points", "validation", held_out)] if held_out else []
+    return [*sets, (f"left out in turn, {in_turn.folds} folds", "cross_validation", in_turn)] if in_turn else sets
 
 
 def _compared(rows: list[Row], title: str, required: float | None = None) -> Drawing:
@@ -221,10 +208,12 @@ def _compared(rows: list[Row], title: str, required: float | None = None) -> Dra
     known = [v for r in rows for v in (r.hollow, r.full, *r.ticks, required) if v is not None and np.isfinite(v)]
     height = 58.0 + 34.0 * len(rows)
     scale = _log_range(1e3 * np.array(known))
-    chart = framed(460, height, scale, (0, 1), ("mm", "", title), left=12, log=(True, False))
+    chart = Chart(460, height, scale, (0, 1), ("mm", "", title), left=12, log=(True, False))
     shapes = [*_vertical_grid(chart)]
     if required is not None:
-        shapes.append(shape("path", class_="limit", d=f"M{float(chart.x(1e3 * required)):.1f} 4V{height - 38:.1f}"))
+        shapes.append(
+            shape("path", class_="limit", d=f"M{float(chart.x(1e3 * required)):.1f} 4V{height - 38:.1f}")
+        )
     for i, row in enumerate(rows):
         shapes += _compared_row(chart, row, 30.0 + 34.0 * i)
     return Drawing("chart", f"460 {height:g}", title, shapes)
@@ -308,7 +297,7 @@ def gate_chart(report: CalibrationReport, points: Points) -> Drawing:
 def _by_row(report: CalibrationReport, y: tuple[float, float], unit: str, title: str, *, log: bool) -> Chart:
     count = len(report.problem.data)
     rows = (-0.02 * count - 0.5, 1.02 * count - 0.5)
-    return framed(460, 250, rows, y, ("row of the data, from 0", unit, title), log=(False, log))
+    return Chart(460, 250, rows, y, ("row of the data, from 0", unit, title), log=(False, log))
 
 
 # ── residuals, joint by joint ────────────────────────────────────────────────────────────────────────
@@ -316,20 +305,29 @@ def _by_row(report: CalibrationReport, y: tuple[float, float], unit: str, title:
 
 def joint_charts(report: CalibrationReport) -> list[Drawing]:
     """A chart per joint: the residual's parts against the joint's coordinate."""
-    robot, e, data = report.estimate.calibrated, report.estimate, report.problem.data
+    e, data = report.estimate, report.problem.data
     use = data.seen & (point_states(e) != REJECTED)
     parts = 1e3 * joint_residuals(report)
     highest = float(np.nanmax(np.abs(np.where(use[None, :, :, None], parts, 0.0)), initial=0.0)) or 1.0
     where = np.argwhere(use)
     chosen = where[thinned(e.normalised_residuals[tuple(where.T)], MOST_DOTS // 2)]
     charts = []
-    for k, name in enumerate(robot.joint_names):
-        factor, unit = (180 / np.pi, "°") if robot.joint_is_revolute[k] else (1e3, "mm")
-        q = factor * data.q[:, k]
-        labels = (f"{name} [{unit}]", "mm", f"residuals against {name}")
-        chart = framed(340, 200, _padded(q), (-highest, highest), labels)
+    for k in range(len(parts)):
+        chart, q = _by_joint(e, k, data.q, 200, "mm", highest, "residuals against")
         charts.append(chart.drawing(*_joint_marks(chart, q, parts[k], chosen, use)))
     return charts
+
+
+def _by_joint(
+    e: Estimate, k: int, q: FloatArray, height: float, unit: str, highest: float, what: str
+) -> tuple[Chart, FloatArray]:
+    """The frame for values of ± ``highest`` against joint k, and its coordinates in it; q (N, joints) [rad | m]."""
+    name, turns = e.joint_names[k], bool(e.calibrated.joint_is_revolute[k])
+    shown = joint_factor(turns) * q[:, k]
+    pad = 0.03 * float(np.ptp(shown)) or 1.0
+    across = float(shown.min()) - pad, float(shown.max()) + pad
+    labels = (f"{name} [{joint_unit(turns)}]", unit, f"{what} {name}")
+    return Chart(340, height, across, (-highest, highest), labels), shown
 
 
 def _joint_marks(
@@ -374,20 +372,16 @@ def joint_residuals(report: CalibrationReport) -> FloatArray:
 
 def correction_charts(report: CalibrationReport) -> list[Drawing]:
     """φ of each joint over the angles that were measured, if joint corrections were learnt."""
-    transmission, q = report.estimate.transmission, report.problem.data.q
-    if transmission is None:
+    e, q = report.estimate, report.problem.data.q
+    if e.transmission is None:
         return []
     grid = np.linspace(q.min(axis=0), q.max(axis=0), 121)
-    phi = 1e3 * transmission.corrections.at(grid)
+    phi = 1e3 * e.transmission.corrections.at(grid)
     highest = 1.1 * float(np.abs(phi).max()) or 1.0
     charts = []
-    for k, name in enumerate(report.estimate.joint_names):
-        turns = report.estimate.calibrated.joint_is_revolute[k]
-        factor, units = (180 / np.pi, ("°", "mrad")) if turns else (1e3, ("mm", "mm"))
-        along = factor * grid[:, k]
-        labels = (f"{name} [{units[0]}]", units[1], f"joint correction of {name}")
-        chart = framed(340, 160, _padded(along), (-highest, highest), labels)
-        charts.append(chart.drawing(chart.line("mean along", along, phi[:, k])))
+    for k, turns in enumerate(e.calibrated.joint_is_revolute):
+        chart, shown = _by_joint(e, k, grid, 160, "mrad" if turns else "mm", highest, "joint correction of")
+        charts.append(chart.drawing(chart.line("mean along", shown, phi[:, k])))
     return charts
 
 

@@ -71,7 +71,7 @@ def report_page(report: CalibrationReport) -> str:
         rounded=rounded,
         mark=mark,
         advice=advice,
-        sets=_sets(report.estimate),
+        sets=[(name, f"estimate.{key}") for name, key, _ in charts.validation_sets(report.estimate)],
         parameters=_parameters(report.estimate),
         placed=any(name.startswith(PLACEMENT) for name in report.estimate.parameters),
         structure=_structure(report.estimate),
@@ -125,12 +125,6 @@ def rounded(value: float, style: str) -> str:
 
 
 # ── what the template lists ──────────────────────────────────────────────────────────────────────────
-
-
-def _sets(e: Estimate) -> list[tuple[str, str]]:
-    """Name and key of each validation."""
-    keys = [f"estimate.{k}" for k in ("validation", "cross_validation") if getattr(e, k) is not None]
-    return [(name, key) for key, (name, _) in zip(keys, charts.validation_sets(e), strict=True)]
 
 
 def _parameters(e: Estimate) -> list[dict[str, Any]]:

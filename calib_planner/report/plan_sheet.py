@@ -3,10 +3,10 @@
 The page says what was checked and what was not; a cell is empty or says ``not checked`` rather than look good.
 
 *The drawings* let a person recognise each posture. The robot is the line through base, joint origins, tip and
-reflectors, in the axes of its own base, whatever the frame of positions. From the side: the vertical plane through
-joint 1 and the reflector, so that an arm is seen in full wherever it points; across is the distance from joint 1.
-From above: x to the right, y up the page. One scale for both views of all postures. A robot that moves in its
-base's horizontal plane has no view from the side.
+reflectors, in the axes of its own base, whatever the frame of positions. The side view shows the vertical plane
+through joint 1 and the reflector, so that it shows the whole arm wherever it points; across is the distance from
+joint 1. The top view has x to the right and y up the page. All drawings have one scale. A robot that moves in the
+horizontal plane of its base has no side view.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from calib_planner.planning import NEVER, POSE_CRITERIA, PlanSheet
 from calib_planner.report.render import TEMPLATES, Drawing, Shape, render, shape
 from calib_planner.report.scene import bodies
 from calib_planner.robot import Robot
-from calib_planner.units import duration, length, signed
+from calib_planner.units import duration, joint_factor, joint_unit, length, signed
 
 BOXES = 12
 """More repetitions than this get one box with their number."""
@@ -91,7 +91,7 @@ def _facts(sheet: PlanSheet) -> Iterator[tuple[str, str, str]]:
         yield "lower bound" if metric else "bound", best, remark
         meaning = "lower bound over expected" if metric else "by the criterion's own measure"
         yield "efficiency", f"{100 * plan.efficiency:.1f} %", meaning
-    yield "measurements", str(plan.measurements), f"at {len(plan.configurations)} stops"
+    yield "measurements", str(plan.measurements), f"at {len(plan.configurations)} visits"
     yield "estimated time", duration(times.seconds), f"{duration(times.standing)} of it at standstill"
     yield "tracker", f"σ = {length(plan.sigma)}", "of one coordinate, assumed by the plan"
 
@@ -102,7 +102,7 @@ def _alarms(sheet: PlanSheet) -> Iterator[str]:
     for word, mask in (("reachable", checks.reachable), ("visible", checks.visible)):
         wrong = [] if mask is None else [str(i + 1) for i in np.flatnonzero(~mask)]
         if wrong:
-            yield f"Not {word}: stop{'s' if len(wrong) > 1 else ''} {', '.join(wrong)}. See the rows below."
+            yield f"Not {word}: visit{'s' if len(wrong) > 1 else ''} {', '.join(wrong)}. See the rows below."
     if plan.robot != sheet.robot.name:
         yield f"The plan was made for {plan.robot}, this sheet for {sheet.robot.name}."
     if plan.status != "ok":
@@ -115,31 +115,37 @@ def _alarms(sheet: PlanSheet) -> Iterator[str]:
 def _row(sheet: PlanSheet, i: int, drawing: Drawing) -> dict[str, Any]:
     """What the template lists of visit i."""
     plan, turns = sheet.plan, sheet.robot.joint_is_revolute
-    values = zip(plan.joint_names, turns, sheet.degrees[i], plan.configurations[i], strict=True)
+    values = zip(plan.joint_names, turns, plan.configurations[i], strict=True)
     joint, margin = sheet.tightest()[i]
-    left = f"{signed(np.degrees(margin), 1)}°" if turns[joint] else f"{signed(1e3 * margin, 1)} mm"
     return {
         "drawing": drawing,
-        "joints": [(n, f"{signed(big, 3)}{'°' if t else ' mm'}", signed(si, 6)) for n, t, big, si in values],
+        "joints": [(name, _joint(q, is_turning, 3), signed(q, 6)) for name, is_turning, q in values],
         "travel": list(_travel(sheet, i)),
         "reach_breaks": sheet.checks.reach_breaks[i],
-        "margin": (left, plan.joint_names[joint]),
+        "margin": (_joint(margin, turns[joint], 1), plan.joint_names[joint]),
         "view_breaks": None if sheet.checks.visible is None else sheet.checks.view_breaks[i],
         "view": list(_view(sheet, i)),
         "repetitions": int(plan.repetitions[i]),
     }
 
 
+def _joint(value: float, turns: bool, digits: int) -> str:
+    """A joint value [rad | m] in ° or mm, with its unit."""
+    return f"{signed(joint_factor(turns) * value, digits)}{_unit_of(turns)}"
+
+
+def _unit_of(turns: bool) -> str:
+    return joint_unit(turns) if turns else f" {joint_unit(turns)}"
+
+
 def _travel(sheet: PlanSheet, i: int) -> Iterator[str]:
     """Lines on the way to visit i; none if the start is not known."""
     if np.isnan(sheet.timetable.travel[i]).any():
         return
-    for turning, factor, unit in ((True, 180.0 / np.pi, "°"), (False, 1e3, " mm")):
-        count = (sheet.robot.joint_is_revolute == turning).sum()
-        if count:
-            yield f"max {factor * sheet.total_travel(True, turning)[i]:.1f}{unit}"
-        if count > 1:
-            yield f"sum {factor * sheet.total_travel(False, turning)[i]:.1f}{unit}"
+    for turns in (True, False):
+        count = (sheet.robot.joint_is_revolute == turns).sum()
+        for word, largest in (("max", True), ("sum", False))[:count]:  # of a single joint they are the same
+            yield f"{word} {joint_factor(turns) * sheet.total_travel(largest, turns)[i]:.1f}{_unit_of(turns)}"
 
 
 def _view(sheet: PlanSheet, i: int) -> Iterator[str]:
@@ -174,7 +180,9 @@ class View(NamedTuple):
     ground: bool
 
 
-def posture_drawings(robot: Robot, configurations: FloatArray, station: FloatArray | None = None) -> list[Drawing]:
+def posture_drawings(
+    robot: Robot, configurations: FloatArray, station: FloatArray | None = None
+) -> list[Drawing]:
     """A drawing per configuration (N, joints) [rad | m]; ``station`` (3,) in the frame of positions [m]."""
     views = _views(robot, configurations, station)
     spans = [np.ptp(v.points, axis=(0, 1)) for v in views]
@@ -206,14 +214,15 @@ def _drawing(views: list[View], i: int, scale: float, targets: int) -> Drawing:
     tall = max(np.ptp(v.points[..., 1]) for v in views) * scale
     used = sum(np.ptp(v.points[..., 0]) for v in views) * scale + GAP * (len(views) - 1)
     width, height = max(used + 2 * RIM, NARROWEST), tall + 2 * RIM + CAPTION
-    shapes, left = [], (width - used) / 2
+    shapes: list[Shape] = []
+    left = (width - used) / 2
     for view in views:
         low, wide = view.points.min(axis=(0, 1)), np.ptp(view.points[..., 0]) * scale
         xy = (view.points[i] - low) * scale * UPWARDS + [left, RIM + tall]
         shapes += _drawn(view, i, xy, targets)
         shapes.append(shape("text", view.name, x=f"{left + wide / 2:.1f}", y=f"{height - 2:.1f}"))
         left += wide + GAP
-    title = f"stop {i + 1}, {' and '.join(v.name for v in views)} view"
+    title = f"visit {i + 1}, {' and '.join(v.name for v in views)} view"
     return Drawing("posture", f"{width:.1f} {height:.1f}", title, shapes)
 
 

@@ -1,8 +1,7 @@
 """The one template engine of all pages, and drawings as data for it.
 
-A page is a template and values. A drawing is a list of shapes, of which the macro ``svg`` in ``templates/macros.html``
-makes an ``<svg>``. The engine escapes every text, so names of robots, joints and files may hold anything, and no
-other file writes markup.
+A page is a template and values. A drawing is a list of shapes, which the macro ``svg`` of ``macros.html`` writes.
+The engine escapes every text: names of robots, joints and files may hold anything. No other file writes markup.
 """
 
 from __future__ import annotations

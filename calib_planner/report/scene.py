@@ -10,13 +10,14 @@ rejected, and an even choice of the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.identification import Estimate, IdentificationProblem
+from calib_planner.planning import plain
 from calib_planner.report.render import Drawing, Shape, shape
 from calib_planner.robot import Robot
 
@@ -66,23 +67,12 @@ class Scene:
     tracker: FloatArray | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Lists, rounded to what can be seen: positions to 10 µm, errors to 10 nm, angles to 10 µrad."""
-        return {
-            "joint_names": list(self.joint_names),
-            "revolute": list(self.revolute),
-            "q": self.q.round(5).tolist(),
-            "rows": self.rows.tolist(),
-            "targets": self.targets.tolist(),
-            "points": self.points.round(5).tolist(),
-            "after": self.after.round(8).tolist(),
-            "before": self.before.round(8).tolist(),
-            "states": self.states.tolist(),
-            "robot_rows": self.robot_rows.tolist(),
-            "robots": self.robots.round(4).tolist(),
-            "test_robots": self.test_robots.round(4).tolist(),
-            "target_count": self.target_count,
-            "tracker": None if self.tracker is None else self.tracker.round(4).tolist(),
-        }
+        """Plain values, rounded to what can be seen: positions to 10 µm, errors to 10 nm, angles to 10 µrad."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        digits = {"q": 5, "points": 5, "after": 8, "before": 8, "robots": 4, "test_robots": 4}
+        digits |= {"tracker": 4} if self.tracker is not None else {}
+        rounded: dict[str, Any] = plain(values | {name: values[name].round(n) for name, n in digits.items()})
+        return rounded
 
 
 def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatArray) -> Scene:
@@ -93,7 +83,9 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
     seen = tuple(where.T)
     states = point_states(estimate)[seen]
     size = np.linalg.norm(estimate.residuals[seen], axis=1)
-    rows = _robot_rows(len(data), where[:, 0], np.where(states == USED, size, np.inf))
+    worst = np.full(len(data), -1.0)
+    np.maximum.at(worst, where[:, 0], np.where(states == USED, size, np.inf))
+    rows = thinned(worst, MOST_ROBOTS)
     return Scene(
         joint_names=robot.joint_names,
         revolute=tuple(bool(r) for r in robot.joint_is_revolute),
@@ -132,16 +124,11 @@ def thinned(importance: FloatArray, most: int) -> IntArray:
     return np.unique(np.concatenate([first, even]))
 
 
-def _robot_rows(count: int, rows: IntArray, importance: FloatArray) -> IntArray:
-    worst = np.full(count, -1.0)
-    np.maximum.at(worst, rows, importance)
-    return thinned(worst, MOST_ROBOTS)
-
-
 def bodies(robot: Robot, q: FloatArray) -> FloatArray:
-    """(N, B, 3) base, a point on each joint's axis, tip, then the targets, in the axes of the robot's own base [m].
+    """(N, B, 3) base, a point on each joint's axis, tip, then the targets, in the frame of the base [m].
 
-    ``q`` (N, joints) [rad | m].
+    Args:
+        q: (N, joints) configurations [rad | m].
     """
     turn, place = robot.base_pose
     if not len(q):
@@ -156,8 +143,7 @@ def _tracker(problem: IdentificationProblem, turn: FloatArray, place: FloatArray
     """From the instrument if it knows its station, else the origin of a frame that is not the base's own."""
     station = getattr(problem.instrument, "station", None)
     own = np.allclose(turn, np.eye(3), atol=1e-9) and np.allclose(place, 0.0, atol=1e-9)
-    asked = any(n.startswith("base.") for n in problem.robot.parameter_names)
-    if station is None and own and not asked:
+    if station is None and own and not any(n.startswith("base.") for n in problem.robot.parameter_names):
         return None
     return np.asarray((np.zeros(3) if station is None else np.asarray(station)) - place) @ turn
 
