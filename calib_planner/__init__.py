@@ -23,7 +23,16 @@ if TYPE_CHECKING:
     from calib_planner.identification import Estimate, IdentificationProblem, identify, validate
     from calib_planner.io import Robot
     from calib_planner.measurements import Measurements
-    from calib_planner.planning import Plan, PlanProblem, Progress, plan
+    from calib_planner.planning import (
+        Candidates,
+        Plan,
+        PlanPrior,
+        PlanProblem,
+        PlanQuality,
+        Progress,
+        Search,
+        plan,
+    )
 
 __version__ = "0.1.0"
 
@@ -35,6 +44,6 @@ __getattr__, __dir__, __all__ = lazy_door(
         "identification": "Estimate IdentificationProblem identify validate",
         "io": "Robot",  # ``Robot.load`` reads files, which is what ``io`` teaches it
         "measurements": "Measurements",
-        "planning": "Plan PlanProblem Progress plan",
+        "planning": "Candidates Plan PlanPrior PlanProblem PlanQuality Progress Search plan",
     },
 )

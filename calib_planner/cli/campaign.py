@@ -144,6 +144,7 @@ def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
         poses,
         args.required_accuracy,
         **{name: getattr(args, name) for name in NUMBERS},
+        sigma=args.sigma,
         **conditions(args, robot),
         identification={"joint_corrections": args.joint_corrections},
         starts=args.starts,

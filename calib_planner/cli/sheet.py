@@ -181,14 +181,14 @@ def show_sheet(sheet: PlanSheet, console: Console) -> None:
 
 
 def _promise(sheet: PlanSheet) -> str:
-    plan = sheet.plan
-    accuracy = (
-        f"Expected accuracy ρ0 {length(plan.predicted_accuracy)}" if len(plan.test_poses) else plan.criterion
-    )
-    if not np.isfinite(plan.efficiency):
+    quality = sheet.plan.quality
+    accuracy = quality.criterion
+    if len(sheet.plan.test_poses):
+        accuracy = f"Expected accuracy ρ0 {length(quality.predicted_accuracy)}"
+    if not np.isfinite(quality.efficiency):
         return f"{accuracy}."
-    bound = f", lower bound {length(plan.lower_bound)}" if np.isfinite(plan.lower_bound) else ""
-    return f"{accuracy}{bound} ({plan.bound}), efficiency {100 * plan.efficiency:.1f} %."
+    bound = f", lower bound {length(quality.lower_bound)}" if np.isfinite(quality.lower_bound) else ""
+    return f"{accuracy}{bound} ({quality.bound}), efficiency {100 * quality.efficiency:.1f} %."
 
 
 def _stops(sheet: PlanSheet) -> Table:

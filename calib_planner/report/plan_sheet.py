@@ -76,21 +76,21 @@ def sheet_page(sheet: PlanSheet) -> str:
 
 def _facts(sheet: PlanSheet) -> Iterator[tuple[str, str, str]]:
     """Name, value and remark of what the plan promises and costs."""
-    plan, times = sheet.plan, sheet.timetable
-    metric = plan.criterion in POSE_CRITERIA
+    plan, quality, times = sheet.plan, sheet.plan.quality, sheet.timetable
+    metric = quality.criterion in POSE_CRITERIA
     if len(plan.test_poses):
         poses = f"at {len(plan.test_poses)} test poses, rms" if len(plan.test_poses) > 1 else "at the test pose"
-        yield "expected accuracy ρ0", length(plan.predicted_accuracy), poses
+        yield "expected accuracy ρ0", length(quality.predicted_accuracy), poses
     if not metric:
-        yield f"criterion {plan.criterion}", f"{plan.value:.5g}", "its own unit"
-    if plan.bound == "none":
+        yield f"criterion {quality.criterion}", f"{quality.value:.5g}", "its own unit"
+    if quality.bound == "none":
         yield "lower bound", "none", "this criterion has none"
     else:
-        best = length(plan.value_bound) if metric else f"{plan.value_bound:.5g}"
-        remark = f"no plan of {plan.measurements} is better ({plan.bound})"
+        best = length(quality.value_bound) if metric else f"{quality.value_bound:.5g}"
+        remark = f"no plan of {plan.measurements} is better ({quality.bound})"
         yield "lower bound" if metric else "bound", best, remark
         meaning = "lower bound over expected" if metric else "by the criterion's own measure"
-        yield "efficiency", f"{100 * plan.efficiency:.1f} %", meaning
+        yield "efficiency", f"{100 * quality.efficiency:.1f} %", meaning
     yield "measurements", str(plan.measurements), f"at {len(plan.configurations)} visits"
     yield "estimated time", duration(times.seconds), f"{duration(times.standing)} of it at standstill"
     yield "tracker", f"σ = {length(plan.sigma)}", "of one coordinate, assumed by the plan"
@@ -105,8 +105,8 @@ def _alarms(sheet: PlanSheet) -> Iterator[str]:
             yield f"Not {word}: visit{'s' if len(wrong) > 1 else ''} {', '.join(wrong)}. See the rows below."
     if plan.robot != sheet.robot.name:
         yield f"The plan was made for {plan.robot}, this sheet for {sheet.robot.name}."
-    if plan.status != "ok":
-        yield f"{plan.status}: {plan.message}"
+    if plan.quality.status != "ok":
+        yield f"{plan.quality.status}: {plan.quality.message}"
 
 
 # ── the rows ─────────────────────────────────────────────────────────────────────────────────────────

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.arrays import FloatArray, IntArray, plain
 from calib_planner.identification import Estimate, IdentificationProblem
-from calib_planner.planning import plain
 from calib_planner.report.render import Drawing, Shape, shape
 from calib_planner.robot import Robot
 

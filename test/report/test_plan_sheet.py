@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from robots import mixed, plan_of, random_configurations
+from robots import changed, mixed, plan_of, random_configurations
 from scipy.spatial.transform import Rotation
 
 from calib_planner import Robot
@@ -109,7 +109,7 @@ def test_what_is_wrong_is_said_with_its_reason():
         assert reach == (q[0] > sheet.plan.configurations[2, 0])
         assert ("no <b>room</b>" in row) != reach and "tracker range" in row and "incidence" in row
     assert "Not visible: visits 1, 2, 3, 4, 5." in text and "Not reachable: visit" in text
-    other = replace(sheet, plan=replace(sheet.plan, robot="<another>", status="singular", message="Beware."))
+    other = replace(sheet, plan=changed(sheet.plan, robot="<another>", status="singular", message="Beware."))
     assert "made for &lt;another&gt;" in sheet_page(other) and "singular: Beware." in sheet_page(other)
 
 
