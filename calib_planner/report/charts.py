@@ -321,7 +321,7 @@ def joint_charts(report: CalibrationReport) -> list[Drawing]:
 def _by_joint(
     e: Estimate, k: int, q: FloatArray, height: float, unit: str, highest: float, what: str
 ) -> tuple[Chart, FloatArray]:
-    """The frame for values of ± ``highest`` against joint k, and its coordinates in it; q (N, joints) [rad | m]."""
+    """The frame for values up to ± ``highest`` of joint k, and its coordinates there; q (N, joints) [rad | m]."""
     name, turns = e.joint_names[k], bool(e.calibrated.joint_is_revolute[k])
     shown = joint_factor(turns) * q[:, k]
     pad = 0.03 * float(np.ptp(shown)) or 1.0
