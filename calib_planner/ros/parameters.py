@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.ros.rclpy_ext.lifecycle import given_parameters
 from calib_planner.units import brief, cut
 
 P = TypeVar("P")
@@ -162,8 +163,8 @@ class NodeParameters(Generic[P]):
     def __init__(self, node: Node, defaults: P) -> None:
         self._items: dict[str, Field[Any]] = {f.name: f for f in fields(defaults)}  # type: ignore[arg-type]
         self.in_use = False
-        given: Mapping[str, Parameter] = node._parameter_overrides
-        check_names(given, list(self._items), list(node._parameters))
+        given = given_parameters(node)
+        check_names(given, list(self._items), list(node.get_parameters_by_prefix("")))
         for name in given.keys() & self._items.keys():
             check_value(self._items[name], given[name])
         values = {
