@@ -108,8 +108,8 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         """Forget what ``configure`` made, besides publishers, services and so on."""
 
     def undo_with(self, callback: Callable[..., Any], *args: Any) -> None:
-        """In ``configure`` or ``activate``: have ``callback(*args)`` called on the way back, the last one
-        first.""" self._made[-1].callback(callback, *args)
+        """In ``configure`` or ``activate``: call ``callback(*args)`` on the way back, the last one first."""
+        self._made[-1].callback(callback, *args)
 
     @property
     def is_active(self) -> bool:
