@@ -36,7 +36,7 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import CalibPlannerError
 from calib_planner.identification import Estimate
 from calib_planner.planning import Search
-from calib_planner.robot import analyse
+from calib_planner.robot import analyse, is_nuisance
 from calib_planner.simulation import Faults, SimulatedCell, World, make_tour, play, random_deviations
 
 SIGMA = 3e-5
@@ -152,7 +152,7 @@ def true_deviations(robot: Robot, q: FloatArray, seed: int) -> dict[str, float]:
     found = analyse(robot.jacobian(q).reshape(-1, len(robot.parameter_names)), robot.parameter_names)
     kept = {robot.parameter_names[i] for i in found.kept}
     drawn = random_deviations(robot, seed)
-    return {n: v for n, v in drawn.items() if n in kept and not n.startswith(("base.", "target_"))}
+    return {n: v for n, v in drawn.items() if n in kept and not is_nuisance(n)}
 
 
 def measure(world: World, q: FloatArray, visits: IntArray) -> tuple[list[Standstill], Counter[str]]:
@@ -204,7 +204,7 @@ def worst_error(found: Estimate, truth: dict[str, float]) -> tuple[float, str]:
     """Largest |error|/std of the robot's own parameters that were identified, and whose."""
     worst, where = 0.0, ""
     for name, value, std in zip(found.parameters, found.deviations, found.std, strict=True):
-        if name.startswith(("base.", "target_")) or not np.isfinite(std) or name in found.held:
+        if is_nuisance(name) or not np.isfinite(std) or name in found.held:
             continue
         ratio = abs(value - truth.get(name, 0.0)) / std
         if ratio > worst:

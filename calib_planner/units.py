@@ -7,7 +7,7 @@ file or over a wire are of any length; messages show no more of them than a line
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -91,12 +91,6 @@ def listed(names: Iterable[object], most: int = 30, *, width: int = 200, none: s
     shown = [t[:width] if t.isprintable() else ascii(t[:width]) for t in texts[:most]]
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return ", ".join(shown) + more or none
-
-
-def grouped(names: Sequence[str]) -> list[str]:
-    """Parameter names with ``base.x, base.y, …`` as ``base.*``, targets likewise; other names as they are."""
-    placed = ("base.", "target_")
-    return list(dict.fromkeys(n.partition(".")[0] + ".*" if n.startswith(placed) else n for n in names))
 
 
 def cut(text: object, most: int = 1000) -> str:

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib_planner.identification import Estimate, NoiseLevels, Validation
+from calib_planner.robot import is_nuisance
 from calib_planner.units import length
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
@@ -52,12 +53,6 @@ def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], s
     _show_list(console, "Hardly seen by the data, weakest first:", estimate.nearly_dependent)
     _show_points(console, "Rejected", estimate.rejected, where)
     _show_points(console, "Used, but far off", estimate.suspects, where)
-
-
-def grouped(names: Sequence[str]) -> list[str]:
-    """``base.x, base.y, …`` as ``base.*``, targets likewise; other names as they are."""
-    placed = ("base.", "target_")
-    return list(dict.fromkeys(n.partition(".")[0] + ".*" if n.startswith(placed) else n for n in names))
 
 
 # ── is it good? ──────────────────────────────────────────────────────────────────────────────────────
@@ -172,7 +167,7 @@ def _parameters(estimate: Estimate) -> Table:
             remarks.get(name, ""),
             style="dim" if held else "",
         )
-    if any(n.startswith(("base.", "target_")) for n in estimate.parameters):
+    if any(map(is_nuisance, estimate.parameters)):
         table.caption = "nominal of an unknown base or target: its closed-form start"
     return table
 

@@ -26,7 +26,7 @@ from calib_planner.cli.arguments import (
     load_robot,
     test_poses,
 )
-from calib_planner.cli.estimate_table import grouped, show_estimate
+from calib_planner.cli.estimate_table import show_estimate
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, NotEnoughDataError
 from calib_planner.identification import (
@@ -56,7 +56,7 @@ from calib_planner.io import (
 )
 from calib_planner.measurements import Measurements
 from calib_planner.report import Provenance, provenance, write_report
-from calib_planner.robot import Robot, not_in_origins
+from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
 
 EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \\

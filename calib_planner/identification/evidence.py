@@ -21,7 +21,7 @@ from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
 from calib_planner.identification.transmission import Transmission
 from calib_planner.measurements import Measurements
-from calib_planner.robot import Identifiability, Robot, describe
+from calib_planner.robot import Identifiability, Robot, describe, is_nuisance
 from calib_planner.units import length
 
 BLIND = 1e-5
@@ -144,7 +144,7 @@ def fit_placement(robot: Robot, data: Measurements) -> Robot:
 
 def _placement(robot: Robot) -> list[str]:
     """Names of the unknown base's and targets' parameters."""
-    return [n for n in robot.parameter_names if n.startswith(("base.", "target_"))]
+    return [n for n in robot.parameter_names if is_nuisance(n)]
 
 
 def _placed(robot: Robot, data: Measurements, use: NDArray[np.bool_]) -> tuple[Motion, FloatArray]:

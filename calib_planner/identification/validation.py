@@ -39,7 +39,7 @@ from calib_planner.identification.robust import normalised
 from calib_planner.identification.solver import identify, start_robot
 from calib_planner.identification.transmission import Transmission
 from calib_planner.measurements import Measurements
-from calib_planner.robot import Robot
+from calib_planner.robot import Robot, target_parameters
 
 INSIDE = float(np.sqrt(chdtri(3, 0.05)))
 
@@ -237,7 +237,7 @@ def _with_seat(
 ) -> tuple[FloatArray, FloatArray]:
     """J − J_t G J₀ and the covariance of e − J_t G e₀, target by target."""
     targets = len(model.robot.targets)
-    names = tuple(f"target_{t + 1}.{a}" for t in range(targets) for a in "xyz")
+    names = target_parameters(targets)
     moved = replace(model.robot, parameter_names=names)
     at_seat = moved.jacobian(model.actual(seat.q)).reshape(len(seat), targets, 3, -1)
     at_rest = moved.jacobian(model.actual(rest.q)).reshape(len(rest), targets, 3, -1)

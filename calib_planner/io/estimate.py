@@ -28,7 +28,7 @@ from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import ChiSquare, Estimate, JointCorrections, NoiseLevels, Reason, Verdict
 from calib_planner.io.yaml import Node, read_document, write_document
-from calib_planner.robot import Element, Robot
+from calib_planner.robot import Element, Robot, is_nuisance
 
 T = TypeVar("T")
 BASE = ("x", "y", "z", "yaw", "pitch", "roll", "rx", "ry", "rz")
@@ -306,7 +306,7 @@ class SavedEstimate:
     @property
     def chain_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are neither the base's nor the targets'."""
-        return tuple(n for n in self.parameters if not n.startswith(("base.", "target_")))
+        return tuple(n for n in self.parameters if not is_nuisance(n))
 
 
 def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:

@@ -27,7 +27,7 @@ from calib_planner.errors import UnknownNameError
 from calib_planner.identification import Prior
 from calib_planner.io.estimate import parse_estimate
 from calib_planner.io.yaml import Node, read_yaml
-from calib_planner.robot import Parameter, Robot
+from calib_planner.robot import BASE, BASE_PARAMETERS, TARGET, Parameter, Robot, role_of, target_parameters
 from calib_planner.units import listed
 
 WHAT = "a YAML of prior knowledge, or an estimate"
@@ -125,9 +125,8 @@ def _place(one: Node, name: str, factor: float) -> float:
 def _placed_by_data(robot: Robot) -> set[str]:
     """Active parameters whose start is a closed form of the data, whatever the robot's own values."""
     active = set(robot.parameter_names)
-    base = {f"base.{a}" for a in ("x", "y", "z", "rx", "ry", "rz")}
-    targets = {f"target_{t + 1}.{a}" for t in range(len(robot.targets)) for a in "xyz"}
-    return {name for group in (base, targets) if group <= active for name in group}
+    groups = (BASE_PARAMETERS, target_parameters(len(robot.targets)))
+    return {name for group in groups if active.issuperset(group) for name in group}
 
 
 def _from_estimate(top: Node, robot: Robot, targets: bool) -> PriorFile:
@@ -137,8 +136,8 @@ def _from_estimate(top: Node, robot: Robot, targets: bool) -> PriorFile:
     if not known:
         raise top["parameters"].error("no standard deviations", "an estimate that knows how sure it is")
     wanted = set(robot.parameter_names)
-    unwanted = ("base.",) if targets else ("base.", "target_")
-    taken = [n for n in known if n in wanted and not n.startswith(unwanted)]
+    unwanted = (BASE,) if targets else (BASE, TARGET)
+    taken = [n for n in known if n in wanted and role_of(n) not in unwanted]
     if not taken:
         expected = f"some of: {', '.join(robot.parameter_names)}"
         raise top["parameters"].error("no parameter that is to be identified", expected)

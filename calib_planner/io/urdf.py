@@ -167,6 +167,7 @@ def _robot(source: str, name: str, chain: list[UrdfJoint]) -> Robot:
             },
             parameter_names=(*lengths, *offsets),
             source=source,
+            from_urdf=True,
         )
     except FileFormatError:
         raise

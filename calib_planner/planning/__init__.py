@@ -22,7 +22,14 @@ from calib_planner.planning.information import (
     smallest_size,
 )
 from calib_planner.planning.planner import Progress, plan
-from calib_planner.planning.problem import POSE_CRITERIA, Candidates, PlanPrior, PlanProblem, Search
+from calib_planner.planning.problem import (
+    POSE_CRITERIA,
+    Candidates,
+    PlanPrior,
+    PlanProblem,
+    Search,
+    usual_discrepancy,
+)
 from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
 from calib_planner.planning.result import KEYS, KINDS, Plan, PlanQuality
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet

@@ -21,6 +21,7 @@ from calib_planner.report.calibration import CalibrationReport, calibration_repo
 from calib_planner.report.provenance import Provenance
 from calib_planner.report.render import TEMPLATES, embedded, render
 from calib_planner.report.scene import still_picture
+from calib_planner.robot import is_nuisance
 from calib_planner.units import length, signed
 
 HEADLINES = {
@@ -31,7 +32,6 @@ HEADLINES = {
 """Mark and words of each level."""
 MOST_PAIRS = 40
 """Correlated pairs that are listed by name."""
-PLACEMENT = ("base.", "target_")
 """Parameters whose nominal value is only a start: how far they moved says nothing."""
 SHOWN = {"m": "mm", "rad": "mrad"}
 
@@ -73,7 +73,7 @@ def report_page(report: CalibrationReport) -> str:
         advice=advice,
         sets=[(name, f"estimate.{key}") for name, key, _ in charts.validation_sets(report.estimate)],
         parameters=_parameters(report.estimate),
-        placed=any(name.startswith(PLACEMENT) for name in report.estimate.parameters),
+        placed=any(map(is_nuisance, report.estimate.parameters)),
         structure=_structure(report.estimate),
         ways=ways_to_apply(report),
         counts={
@@ -141,7 +141,7 @@ def _parameters(e: Estimate) -> list[dict[str, Any]]:
             "unit": SHOWN[unit],
             "fixed": fixed.get(name, ""),
             "partners": partners.get(name, []),
-            "sigmas": None if name.startswith(PLACEMENT) or not e.std[i] > 0 else abs(e.deviations[i] / e.std[i]),
+            "sigmas": None if is_nuisance(name) or not e.std[i] > 0 else abs(e.deviations[i] / e.std[i]),
         }
         for i, (name, unit) in enumerate(zip(e.parameters, e.units, strict=True))
     ]

@@ -18,7 +18,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray, IntArray, plain
 from calib_planner.identification import Estimate, IdentificationProblem
 from calib_planner.report.render import Drawing, Shape, shape
-from calib_planner.robot import Robot
+from calib_planner.robot import BASE, Robot
 
 MOST_ROBOTS = 300
 """Configurations whose robot can be shown."""
@@ -142,7 +142,7 @@ def _tracker(problem: IdentificationProblem, turn: FloatArray, place: FloatArray
     """From the instrument if it knows its station, else the origin of a frame that is not the base's own."""
     station = getattr(problem.instrument, "station", None)
     own = np.allclose(turn, np.eye(3), atol=1e-9) and np.allclose(place, 0.0, atol=1e-9)
-    if station is None and own and not any(n.startswith("base.") for n in problem.robot.parameter_names):
+    if station is None and own and not any(p.role == BASE for p in problem.robot.parameters):
         return None
     return np.asarray((np.zeros(3) if station is None else np.asarray(station)) - place) @ turn
 

@@ -7,7 +7,6 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from action_msgs.srv import CancelGoal
 from calib_planner_msgs.action import ExecutePlan
 from rclpy.action import ActionClient
@@ -36,12 +35,7 @@ def check_executable(plan: Plan, robot: Robot) -> None:
     if plan.measurements > MOST_STANDSTILLS:
         expected = f"at most {MOST_STANDSTILLS}"
         raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
-    low, high = robot.joint_limits.T
-    outside = (plan.configurations < low - 1e-6) | (plan.configurations > high + 1e-6)
-    if outside.any():
-        i, j = (int(k) for k in np.argwhere(outside)[0])
-        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
-        raise InputError(f"plan.configurations, row {i}", f"{plan.configurations[i, j]:.4f}", expected)
+    robot.check_within_limits("plan.configurations", plan.configurations)
 
 
 # ── One ``ExecutePlan`` goal at a time, with an end whatever the robot's side does ──────────────────────────

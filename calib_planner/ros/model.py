@@ -50,12 +50,10 @@ class Model:
     Attributes:
         robot: Its geometry.
         speeds: (joints,) speed limits of the description [rad/s | m/s]; infinite where none is known.
-        described: Whether it was heard, not loaded by name.
     """
 
     robot: Robot
     speeds: FloatArray
-    described: bool = False
 
 
 def shipped_model(name: str, parameters: str | Sequence[str], unknown: str) -> Model:
@@ -90,7 +88,7 @@ def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model
         if len(name) > LONGEST_NAME or not name.isprintable():
             raise FileFormatError(TOPIC, "name", brief(name, 40), f"at most {LONGEST_NAME} printable characters")
     speeds = parse_speed_limits(text, TOPIC, robot.joint_names)
-    return Model(robot, _no_limits(robot) if speeds is None else speeds, described=True)
+    return Model(robot, _no_limits(robot) if speeds is None else speeds)
 
 
 def _no_limits(robot: Robot) -> FloatArray:

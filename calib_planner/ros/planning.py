@@ -20,12 +20,12 @@ from calib_planner.io import config_folder, read_constraints
 from calib_planner.planning import (
     Candidates,
     Constraint,
-    ModelDiscrepancy,
     Plan,
     PlanProblem,
     Progress,
     Search,
     plan,
+    usual_discrepancy,
 )
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import check_rows
@@ -112,8 +112,8 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
     if not (sigma == 0 or SMALLEST_SIGMA <= sigma <= 1.0):
         raise InputError("sigma", sigma, f"0 (the node's default), or {SMALLEST_SIGMA:g} to 1 m")
     criterion = request.criterion or settings.criterion
-    candidates = _candidates(request, settings, robot)
-    real = model.described and candidates is not None and criterion == "test_pose"
+    rows = _candidates(request, settings, robot)
+    candidates = None if rows is None else Candidates(rows)
     return PlanProblem(
         robot,
         poses,
@@ -123,9 +123,9 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         noise=sigma or settings.sigma,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        discrepancy=ModelDiscrepancy() if real else None,
+        discrepancy=usual_discrepancy(robot, criterion, candidates),
         search=Search(starts=settings.starts, seed=int(request.seed), time_limit=limit or settings.time_limit),
-        candidates=None if candidates is None else Candidates(candidates),
+        candidates=candidates,
     )
 
 
@@ -162,12 +162,7 @@ def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> Floa
     if len(rows) > settings.most_candidates:
         advice = "raise the node's parameter most_candidates if you mean it"
         raise InputError("candidates", f"{len(rows)} rows", f"at most {settings.most_candidates}", advice)
-    low, high = robot.joint_limits.T
-    outside = (rows < low - 1e-6) | (rows > high + 1e-6)
-    if outside.any():  # a robot may be sent there
-        i, j = (int(k) for k in np.argwhere(outside)[0])
-        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
-        raise InputError(f"candidates[{i}]", f"{rows[i, j]:g}", expected)
+    robot.check_within_limits("candidates", rows)  # a robot may be sent there
     return rows
 
 
@@ -187,7 +182,7 @@ def _model(request: Any, settings: PlannerParameters, own: Model | NotReady) -> 
     wanted = names or settings.parameters
     if isinstance(own, Model) and request.robot in ("", own.robot.name):
         robot = own.robot.with_parameters(wanted, unknown_words(settings.unknown))
-        return Model(robot, own.speeds, own.described)
+        return Model(robot, own.speeds)
     if not request.robot and isinstance(own, NotReady):
         raise own
     return shipped_model(request.robot, wanted, settings.unknown)

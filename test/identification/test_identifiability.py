@@ -13,7 +13,7 @@ from robots import CASES, mixed, random_configurations
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.errors import CalibPlannerError
 from calib_planner.identification import Prior, typical_prior
-from calib_planner.robot import analyse, describe
+from calib_planner.robot import analyse, describe, is_nuisance
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 UNKNOWN = {"": (), " base": ("base",), " base tool": ("base", "tool")}
@@ -64,7 +64,7 @@ def test_priority_is_base_and_targets_then_the_request(name):
     """Each parameter is kept if and only if those before it leave something of its column."""
     robot = ROBOTS[name]()
     jacobian, names = stacked(robot), robot.parameter_names
-    placed = [i for i, n in enumerate(names) if n.startswith(("base.", "target_"))]
+    placed = [i for i, n in enumerate(names) if is_nuisance(n)]
     order = placed + [i for i in range(len(names)) if i not in placed]
     norms = np.linalg.norm(jacobian, axis=0)
     unit = jacobian / np.where(norms > 1e-9, norms, np.inf)

@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from calib_planner import IdentificationProblem, InputError, Robot, UnknownNameError, identify
 from calib_planner.identification import Prior, typical_prior
 from calib_planner.identification.problem import ANGLE_STD, LENGTH_STD, OFFSET_STD
+from calib_planner.robot import is_nuisance
 from calib_planner.simulation import SimulatedCell, random_deviations
 from calib_planner.tracker import LaserTracker
 
@@ -203,7 +204,7 @@ def test_typical_prior():
     """Lengths and angles by unit; whatever acts as a joint's zero nearly free; base and targets not at all."""
     robot = Robot.load("kuka_kr270").with_targets(np.zeros((1, 3))).with_parameters("full", ("base", "tool"))
     prior = typical_prior(robot)
-    kinematic = [p for p in robot.parameters if not p.name.startswith(("base.", "target_"))]
+    kinematic = [p for p in robot.parameters if not is_nuisance(p.name)]
     assert prior.names == tuple(p.name for p in kinematic)
     np.testing.assert_array_equal(prior.values, [p.nominal for p in kinematic])
     std = dict(zip(prior.names, np.sqrt(np.diag(prior.covariance)), strict=True))
