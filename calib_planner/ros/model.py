@@ -16,16 +16,14 @@ from functools import lru_cache
 import numpy as np
 
 from calib_planner.arrays import FloatArray, frozen
-from calib_planner.errors import CalibPlannerError, FileFormatError
-from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, stored_model
+from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
+from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, shipped_robots, stored_model
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.ros.settings import (
     IdentifierParameters,
     PlannerParameters,
-    load_shipped,
     unknown_words,
-    with_topics,
 )
 from calib_planner.units import brief, cut
 
@@ -71,6 +69,32 @@ def shipped_model(name: str, parameters: str | Sequence[str], unknown: str) -> M
 def _loaded(name: str) -> Robot:
     """Read once: a request that names a robot should not wait for its file."""
     return load_shipped(name, "full")
+
+
+def load_shipped(
+    name: str, parameters: str | Sequence[str], unknown: str = "", targets: int | None = None
+) -> Robot:
+    """A shipped robot with free parameters; other sources are refused, since names may come from anyone.
+
+    Args:
+        targets: Number of targets; see ``with_targets``.
+
+    Raises:
+        UnknownNameError: Not a shipped robot, or it has no such parameters.
+    """
+    if name not in shipped_robots():
+        raise UnknownNameError("robot", name, shipped_robots())
+    return with_targets(Robot.load(name), targets, unknown).with_parameters(parameters, unknown_words(unknown))
+
+
+def with_targets(robot: Robot, targets: int | None, unknown: str) -> Robot:
+    """The robot with as many targets; another number than its own puts all at the tip, with ``tool`` unknown."""
+    if targets is None or targets == len(robot.targets):
+        return robot
+    if "tool" not in unknown_words(unknown):
+        expected = f"{len(robot.targets)} topics, as the robot has targets"
+        raise InputError("tracker_topics", f"{targets} topics", expected, "or set unknown to tool")
+    return robot.with_targets(np.zeros((targets, 3)))
 
 
 def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model:
@@ -216,7 +240,7 @@ def heard_model(text: str, settings: IdentifierParameters) -> IdentifiedModel:
         CalibPlannerError: It is refused.
     """
     found = described_model(text, settings.base_link, settings.tip_link).robot
-    robot = with_topics(found, len(settings.tracker_topics), settings.unknown)
+    robot = with_targets(found, len(settings.tracker_topics), settings.unknown)
     level = settings.parameters or DEFAULT_LEVEL
     return _model(robot.with_parameters(level, unknown_words(settings.unknown)), text, TOPIC, settings)
 

@@ -159,7 +159,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         """Take what the streams say."""
         chosen = self.settings.value
         joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
-        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
+        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen)
         self._keep_frame()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         self.create_timer(chosen.diagnostics_period, self._tick, clock=steady)
