@@ -58,7 +58,7 @@ def imported(folder: Path) -> set[str]:
 
 def launched() -> set[str]:
     """Other packages whose nodes a launch file may start."""
-    files = (ROOT / "launch").glob("*.py")
+    files = [*(ROOT / "launch").glob("*.py"), PACKAGE / "ros" / "launching.py"]
     keywords = [k for path in files for k in ast.walk(ast.parse(path.read_text())) if isinstance(k, ast.keyword)]
     found = {k.value.value for k in keywords if k.arg == "package" and isinstance(k.value, ast.Constant)}
     return {str(name) for name in found} - {"calib_planner"}
@@ -105,7 +105,8 @@ def test_setup_py_and_package_xml_agree() -> None:
 
 def test_every_node_is_an_executable() -> None:
     scripts = dict(text.split(" = ") for text in setup_call()["entry_points"]["console_scripts"])
-    nodes = {p.stem: f"calib_planner.ros.{p.stem}:main" for p in (PACKAGE / "ros").glob("*_node.py")}
+    parts = {p.stem for p in (PACKAGE / "ros" / "nodes").glob("*.py")} - {"__init__"}
+    nodes = {f"{part}_node": f"calib_planner.ros.nodes.{part}:main" for part in parts}
     assert {k: v for k, v in scripts.items() if k.endswith("_node")} == nodes
     for target in scripts.values():
         module, _, function = target.partition(":")
