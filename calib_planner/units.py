@@ -14,6 +14,9 @@ import numpy as np
 MOST_CHARACTERS = 60
 """Characters of a refused value that an error shows."""
 
+MILLI_UNIT = {"m": "mm", "rad": "mrad"}
+"""Unit of a parameter → the unit of 1000 times its value, which tables for people show."""
+
 
 def length(metres: float) -> str:
     """A length with its unit: three digits in µm below one millimetre, else four digits in mm."""

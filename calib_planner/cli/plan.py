@@ -25,11 +25,12 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.identify import TYPICAL
-from calib_planner.cli.sheet import make_folder, robot_pace, write_sheet
+from calib_planner.cli.sheet import robot_pace, write_sheet
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
 from calib_planner.identification import typical_prior
 from calib_planner.io import (
+    make_folder,
     read_configurations,
     read_measurements,
     read_prior,

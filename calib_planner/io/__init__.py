@@ -41,7 +41,7 @@ if TYPE_CHECKING:
         open_store,
         stored_model,
     )
-    from calib_planner.io.text import read_text, write_text
+    from calib_planner.io.text import make_folder, read_text, write_text
     from calib_planner.io.urdf import (
         calibrated_urdf,
         parse_speed_limits,
@@ -66,7 +66,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "sheet": "WORDS write_sheet_csv write_sheet_yaml write_trajectory",
         "store": "ACCEPTED KEPT LONGEST OUTLIER UNDONE CampaignStore Decision StoredCampaign "
         "StoredModel UnavailableStore open_store stored_model",
-        "text": "read_text write_text",
+        "text": "make_folder read_text write_text",
         "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
         "write_calibrated_urdf",
     },

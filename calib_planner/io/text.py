@@ -17,7 +17,7 @@ def user_path(path: str | Path) -> Path:
     return Path(path).expanduser()
 
 
-def make_folder(folder: str | Path, field: str) -> Path:
+def make_folder(folder: str | Path, field: str = "output") -> Path:
     """The folder, made with those above it if it is not there.
 
     Raises:

@@ -22,7 +22,7 @@ from calib_planner.report.provenance import Provenance
 from calib_planner.report.render import TEMPLATES, embedded, render
 from calib_planner.report.scene import still_picture
 from calib_planner.robot import is_nuisance
-from calib_planner.units import length, signed
+from calib_planner.units import MILLI_UNIT, length, signed
 
 HEADLINES = {
     "PASS": ("✓", "Good: apply it"),
@@ -32,8 +32,6 @@ HEADLINES = {
 """Mark and words of each level."""
 MOST_PAIRS = 40
 """Correlated pairs that are listed by name."""
-"""Parameters whose nominal value is only a start: how far they moved says nothing."""
-SHOWN = {"m": "mm", "rad": "mrad"}
 
 
 def write_report(
@@ -84,7 +82,7 @@ def report_page(report: CalibrationReport) -> str:
             "joint_dots": min(points, charts.MOST_DOTS // 2),
         },
         corrected=data["estimate"]["joint_corrections"] is not None,
-        shown_unit=SHOWN,
+        shown_unit=MILLI_UNIT,
         most_pairs=MOST_PAIRS,
         strong=STRONG,
         embedded=embedded,
@@ -138,7 +136,7 @@ def _parameters(e: Estimate) -> list[dict[str, Any]]:
         {
             "index": i,
             "name": name,
-            "unit": SHOWN[unit],
+            "unit": MILLI_UNIT[unit],
             "fixed": fixed.get(name, ""),
             "partners": partners.get(name, []),
             "sigmas": None if is_nuisance(name) or not e.std[i] > 0 else abs(e.deviations[i] / e.std[i]),
