@@ -1,8 +1,8 @@
 """The demonstration without ROS: plan, measure in simulation, identify, compare with the truth and with chance.
 
-``demo_report`` needs the hidden truth, so it works in simulation only; the demonstration over ROS uses it, too. The
-library itself makes the comparison with chance: random plans of the same size, the same true robot, the same noise,
-fresh draws.
+``demo_report`` needs the hidden truth, so it works in simulation only; the demonstration over ROS uses it, too.
+The library itself makes the comparison with chance: random plans of the same size, the same true robot, the same
+noise, fresh draws.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class IdentifiedParameters(Protocol):
 
 @dataclass(frozen=True)
 class DemoParameter:
-    """One parameter: its nominal, true (simulated) and identified value with its std, all in ``unit``, m or rad."""
+    """One parameter: nominal, true (simulated) and identified value with its std, in ``unit``, m or rad."""
 
     name: str
     unit: str
