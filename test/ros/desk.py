@@ -55,15 +55,17 @@ class Desk:
     def now(self) -> CampaignStatus:
         return self.heard[-1]
 
-    def until(self, state: int, seconds: float = 30.0, **fields: Any) -> CampaignStatus:
-        """The first status from now on in that state with these fields, or with at least these counts."""
+    def until(self, state: int, seconds: float = 30.0, said: str = "", **counts: int) -> CampaignStatus:
+        """The first status from the newest one on in that state, with these words and at least these counts."""
+        begin, found = len(self.heard) - 1, list[CampaignStatus]()
 
         def there() -> bool:
-            m = self.now
-            return m.state == state and all(getattr(m, k) >= v for k, v in fields.items())
+            enough = (m for m in self.heard[begin:] if all(getattr(m, k) >= v for k, v in counts.items()))
+            found.extend(m for m in enough if m.state == state and said in m.reason)
+            return bool(found)
 
         try:
             self.bench.wait(there, seconds)
         except AssertionError:
-            raise AssertionError(f"not in state {state} within {seconds} s: {self.now}") from None
-        return self.now
+            raise AssertionError(f"not in state {state} within {seconds} s: {said} {self.now}") from None
+        return found[0]
