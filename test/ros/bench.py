@@ -32,6 +32,34 @@ def overrides(values: Mapping[str, Any]) -> list[Parameter]:
     return [Parameter(k, value=v) for k, v in values.items()]
 
 
+class Client(ActionClient):
+    """As rclpy's, used by one thread and spun by another: an answer waits until its request is noted.
+
+    Else it is thrown away when it comes at once, and its future never ends: https://github.com/ros2/rclpy/issues/1123,
+    mended by pull request 1308, which the wheels do not have.
+    """
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        self._turn = threading.RLock()
+        super().__init__(*args, **named)
+
+    def send_goal_async(self, *args: Any, **named: Any) -> Any:
+        with self._turn:
+            return super().send_goal_async(*args, **named)
+
+    def _get_result_async(self, goal_handle: Any) -> Any:
+        with self._turn:
+            return super()._get_result_async(goal_handle)
+
+    def _cancel_goal_async(self, goal_handle: Any) -> Any:
+        with self._turn:
+            return super()._cancel_goal_async(goal_handle)
+
+    async def execute(self, taken_data: Any) -> None:
+        with self._turn:
+            await super().execute(taken_data)
+
+
 class Bench:
     def __init__(self) -> None:
         self._kept = ExitStack()
@@ -131,7 +159,7 @@ class Bench:
         """The client of an action, one for all: a new one may be answered before discovery has matched it."""
         client = self._action_clients.get(name)
         if client is None:
-            client = self._action_clients[name] = ActionClient(self.client, kind, name)
+            client = self._action_clients[name] = Client(self.client, kind, name)
             self.actions.append(client)
         self.wait(client.server_is_ready)
         return client

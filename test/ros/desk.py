@@ -34,8 +34,15 @@ class Desk:
         if not elsewhere:
             self.node = bench.start(CampaignNode, **(ASKED | parameters))
             bench.wait(lambda: self.heard)
-            for name in ("pause", "resume", "skip"):  # refused: nothing was begun; discovery is through then
-                assert not self.call(name)[0]
+            self.meet()
+
+    def meet(self) -> None:
+        """Have a node without a campaign refuse what can be asked twice.
+
+        Discovery is through then: ``start``, which cannot, is answered at its first call.
+        """
+        for name in ("pause", "resume", "skip"):
+            assert not self.call(name)[0]
 
     def call(self, name: str) -> tuple[bool, str]:
         """A first call may be answered before discovery has matched its reader: then it is repeated."""

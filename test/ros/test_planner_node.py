@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
-from bench import Bench
+from bench import Bench, Client
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import GetParameters
-from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from test_planning import urdf
@@ -122,7 +121,7 @@ def test_every_one_of_a_burst_is_answered(bench: Bench) -> None:
     """Forty at once, goals and calls, and all goals cancelled in one go."""
     bench.start(PlannerNode, robot="planar_2r", starts=20_000)
     kinds = ("goal", "result", "cancel")
-    client = ActionClient(bench.client, PlanAction, ACTION, **{f"{k}_service_qos_profile": EVENTS for k in kinds})
+    client = Client(bench.client, PlanAction, ACTION, **{f"{k}_service_qos_profile": EVENTS for k in kinds})
     bench.actions.append(client)
     caller = bench.client.create_client(PlanCalibration, SERVICE, qos_profile=EVENTS)
     canceller = bench.client.create_client(CancelGoal, f"{ACTION}/_action/cancel_goal")
