@@ -1,7 +1,16 @@
 """From streams of joint states and tracker points to standstills: stamps, clocks and intake."""
 
 from calib_planner.acquisition.clocks import Offset
-from calib_planner.acquisition.intake import MOST_NAMES, pick_joints
+from calib_planner.acquisition.intake import (
+    DROPPED,
+    UNFIT,
+    UNREADABLE,
+    UNSTAMPED,
+    Intake,
+    JointReader,
+    StreamCount,
+    pick_joints,
+)
 from calib_planner.acquisition.standstill import (
     IN_A_ROW,
     NANO,

@@ -12,8 +12,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,20 @@ from typing import Any
 import numpy as np
 
 from calib_planner.acquisition import (
-    MOST_NAMES,
+    DROPPED,
     NANO,
+    UNFIT,
+    UNREADABLE,
+    UNSTAMPED,
+    Intake,
     Rejection,
     Standstill,
-    StandstillDetector,
     StandstillSettings,
+    StreamCount,
     mean_std,
-    pick_joints,
 )
-from calib_planner.arrays import FloatArray, IntArray, check_number, frozen
-from calib_planner.errors import FileFormatError, InputError, MissingExtraError, UnknownNameError
+from calib_planner.arrays import IntArray, check_number, frozen
+from calib_planner.errors import FileFormatError, InputError, MissingExtraError
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 
@@ -52,7 +55,7 @@ class BagMeasurements:
     data: Measurements
     standstills: tuple[Standstill, ...]
     rejections: tuple[Rejection, ...]
-    streams: tuple[Stream, ...]
+    streams: tuple[StreamCount, ...]
     frame_id: str
     damage: str
 
@@ -100,29 +103,29 @@ def read_bag(
     check_number("sigma", sigma, low=0, high=1, unit="m")
     check_number("repeatability", repeatability, low=0, high=1, unit="m")
     with open_bag(path, topics) as recording:
-        intake = Intake(path, robot.joint_names, topics, settings)
-        damage = intake.drain(recording, progress)
-    streams, found = intake.streams(), intake.standstills
+        bag = _BagIntake(path, robot.joint_names, topics, settings)
+        damage = bag.drain(recording, progress)
+    streams, standstills = tuple(bag.intake.streams), tuple(bag.standstills)
     if damage and not accept_damaged:
         counts = ", ".join(f"{s.messages} of {n}" for s, n in zip(streams, recording.promised, strict=True))
-        got = f"{damage}; read: {counts} messages of {', '.join(recording.names)}, {len(found)} standstills"
+        got = f"{damage}; read: {counts} messages of {', '.join(recording.names)}, {len(standstills)} standstills"
         raise FileFormatError(
             path, "bag", got, "an undamaged bag", "repair it, or accept it with --accept-damaged"
         )
     _check_streams(path, streams, robot.joint_names)
-    if not found:
-        raise _no_standstill(path, intake.rejections, streams[0], settings)
-    q, points = np.array([s.joints for s in found]), np.array([s.points for s in found])
-    data = Measurements(robot.joint_names, q, points, mean_std(found, sigma, repeatability))
-    return BagMeasurements(data, tuple(found), tuple(intake.rejections), streams, intake.frame_id, damage)
+    if not standstills:
+        raise _no_standstill(path, bag.rejections, streams[0], settings)
+    q, points = np.array([s.joints for s in standstills]), np.array([s.points for s in standstills])
+    data = Measurements(robot.joint_names, q, points, mean_std(standstills, sigma, repeatability))
+    return BagMeasurements(data, standstills, tuple(bag.rejections), streams, bag.intake.frame, damage)
 
 
 # ── what makes a bag unusable ────────────────────────────────────────────────────────────────────────
 
 
-def _check_streams(path: str | Path, streams: tuple[Stream, ...], joint_names: Sequence[str]) -> None:
+def _check_streams(path: str | Path, streams: tuple[StreamCount, ...], joint_names: Sequence[str]) -> None:
     for number, stream in enumerate(streams):
-        where = f"topic {stream.topic}"
+        where = f"topic {stream.name}"
         if not stream.messages:
             raise FileFormatError(path, where, "no messages", "at least one standstill's", "was the driver on?")
         if not stream.usable:
@@ -136,19 +139,19 @@ def _check_streams(path: str | Path, streams: tuple[Stream, ...], joint_names: S
             raise FileFormatError(path, where, got, wanted, advice)
     joints = streams[0]
     for points in streams[1:]:
-        apart = max(points.first - joints.last, joints.first - points.last)  # type: ignore[operator]
+        apart = max(points.first - joints.last, joints.first - points.last)
         if apart > 0:
             got = " and ".join(
-                f"{s.topic} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (joints, points)
+                f"{s.name} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (joints, points)
             )
             advice = "synchronise the clocks (PTP or NTP) and record again, or correct the stamps"
             raise FileFormatError(path, "header stamps", got, "streams that overlap in time", advice)
 
 
 def _no_standstill(
-    path: str | Path, rejections: list[Rejection], joints: Stream, settings: StandstillSettings
+    path: str | Path, rejections: list[Rejection], joints: StreamCount, settings: StandstillSettings
 ) -> FileFormatError:
-    seconds = ((joints.last or 0) - (joints.first or 0)) / NANO
+    seconds = (joints.last - joints.first) / NANO
     got = f"none in {seconds:.1f} s"
     if rejections:
         got += "; " + "; ".join(_reasons(rejections))
@@ -167,84 +170,31 @@ def _reasons(rejections: list[Rejection] | tuple[Rejection, ...]) -> list[str]:
     return [f"{n} rejected as {why.value} ({first[why]})" for why, n in counts.items()]
 
 
-def _seconds(stamp: int | None) -> str:
-    return f"{(stamp or 0) / NANO:.3f} s"
+def _seconds(stamp: int) -> str:
+    return f"{stamp / NANO:.3f} s"
 
-
-# ── Takes a bag's messages one by one: to the standstill detector, or to the count of what was left out and w
 
 REPORT_EVERY = 2000
 """Messages between two reports of progress."""
-UNREADABLE, UNSTAMPED, UNFIT = "not decodable", "without a stamp", "without the robot's joints"
-NOT_FINITE, DROPPED = "not finite", "too late or twice"
 
 
-@dataclass(frozen=True)
-class Stream:
-    """What became of the messages of a topic.
+class _BagIntake:
+    """Drains a recording into the intake, and collects what that completes.
 
     Attributes:
-        topic: Its name.
-        messages: Read from the bag.
-        left_out: How many of them took no part, by reason.
-        first, last: Earliest and latest stamp [ns], ``None`` without any.
-        example: What was wrong with the first message that was left out, where there is more to say.
-    """
-
-    topic: str
-    messages: int
-    left_out: dict[str, int]
-    first: int | None
-    last: int | None
-    example: str
-
-    @property
-    def usable(self) -> int:
-        """Messages that are stamped, finite and of the robot, in time or not."""
-        return self.messages - sum(n for why, n in self.left_out.items() if why != DROPPED)
-
-    def describe(self) -> str:
-        """One line: messages, and those left out."""
-        lost = ", ".join(f"{n} {why}" for why, n in self.left_out.items())
-        return f"{self.topic}: {self.messages} messages" + (f", left out: {lost}" if lost else "")
-
-
-@dataclass
-class _Tally:
-    messages: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
-    first: int | None = None
-    last: int | None = None
-    example: str = ""
-
-    def leave_out(self, why: str, example: str = "") -> None:
-        self.left_out[why] += 1
-        self.example = self.example or example
-
-    def count(self, stamp: int, values: FloatArray) -> None:
-        self.first = stamp if self.first is None else min(stamp, self.first)
-        self.last = stamp if self.last is None else max(stamp, self.last)
-        if not np.isfinite(values).all():
-            self.left_out[NOT_FINITE] += 1
-
-
-class Intake:
-    """Takes messages one by one and collects what they complete.
-
-    Attributes:
-        standstills, rejections: What was found so far, in the order of completion.
-        frame_id: Frame of the points; empty while no message told.
+        intake: Counts the messages and finds the standstills.
+        standstills, rejections: The results so far, in the order of completion.
     """
 
     def __init__(
         self, path: str | Path, joint_names: tuple[str, ...], topics: BagTopics, settings: StandstillSettings
     ) -> None:
-        self.path, self.joint_names, self.names = path, joint_names, topics.names
+        self.path = path
+        self.intake = Intake(joint_names, topics.names[0], topics.names[1:], settings)
         self.standstills: list[Standstill] = []
         self.rejections: list[Rejection] = []
-        self.frame_id = ""
-        self._detector = StandstillDetector(len(joint_names), len(topics.points), settings)
-        self._tallies = [_Tally() for _ in self.names]
+        assert self.intake.detector is not None
+        self._detector = self.intake.detector
 
     def drain(self, recording: Recording, progress: Callable[[float, str], None] | None) -> str:
         """Take all there is; returns what is damaged, in words, or nothing."""
@@ -259,63 +209,45 @@ class Intake:
             stopped = f"unreadable after {done} messages: {error}"
         self._sort(self._detector.flush())
         damage = [recording.unread, stopped]
-        for name, tally, promised in zip(self.names, self._tallies, recording.promised, strict=True):
-            if tally.messages < promised and not stopped:
-                damage.append(f"{promised - tally.messages} of {promised} messages of {name} are missing")
-            if tally.left_out[UNREADABLE]:
-                count = f"{tally.left_out[UNREADABLE]} of {tally.messages} messages"
-                damage.append(f"{count} of {name} cannot be decoded ({tally.example})")
+        for count, dropped, promised in zip(
+            self.intake.streams, self._detector.dropped, recording.promised, strict=True
+        ):
+            if count.messages < promised and not stopped:
+                damage.append(f"{promised - count.messages} of {promised} messages of {count.name} are missing")
+            if count.left_out[UNREADABLE]:
+                unreadable = f"{count.left_out[UNREADABLE]} of {count.messages} messages"
+                damage.append(f"{unreadable} of {count.name} cannot be decoded ({count.example})")
+            count.left_out = +Counter({**count.left_out, DROPPED: dropped})
         return "; ".join(filter(None, damage))
 
-    def streams(self) -> tuple[Stream, ...]:
-        """What became of the messages."""
-        result = []
-        for name, tally, dropped in zip(self.names, self._tallies, self._detector.dropped, strict=True):
-            left_out = dict(tally.left_out + Counter({DROPPED: dropped}))
-            result.append(Stream(name, tally.messages, left_out, tally.first, tally.last, tally.example))
-        return tuple(result)
-
     def _take(self, stream: int, recording: Recording, data: bytes) -> None:
-        tally = self._tallies[stream]
-        tally.messages += 1
         try:
             message = recording.decode(stream, data)
         except BrokenStorage as error:
-            tally.leave_out(UNREADABLE, str(error))
-            return
-        stamp = int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
-        if stamp <= 0:
-            tally.leave_out(UNSTAMPED)
+            count = self.intake.streams[stream]
+            count.messages += 1
+            count.leave_out(UNREADABLE, str(error), str(error))
             return
         if stream:
-            xyz = self._point(message)
-            tally.count(stamp, xyz)
-            self._sort(self._detector.add_point(stream - 1, stamp, xyz))
+            self._check_frame(message.header.frame_id)
+            self._sort(self.intake.point(stream - 1, message))
             return
-        try:
-            joints = pick_joints(message.name, message.position, self.joint_names)
-        except InputError as error:
-            names = f"it names {', '.join(message.name[:MOST_NAMES])}"
-            tally.leave_out(UNFIT, names if isinstance(error, UnknownNameError) else str(error))
-            return
-        tally.count(stamp, joints)
-        self._sort(self._detector.add_joints(stamp, joints))
+        with suppress(InputError):  # counted with its reason
+            self._sort(self.intake.joints(message))
 
-    def _point(self, message: Any) -> FloatArray:
-        frame = message.header.frame_id
-        if frame and self.frame_id and frame != self.frame_id:
-            got = f"{self.frame_id!r} and {frame!r}"
+    def _check_frame(self, frame: str) -> None:
+        """A bag with points in two frames is refused as a whole: only its owner can say which frame is meant."""
+        if frame and self.intake.frame and frame != self.intake.frame:
+            got = f"{self.intake.frame!r} and {frame!r}"
             advice = "transform the points, or split the bag where the station changed"
             raise FileFormatError(self.path, "frame_id of the points", got, "one frame", advice)
-        self.frame_id = self.frame_id or frame
-        return np.array([message.point.x, message.point.y, message.point.z])
 
     def _sort(self, results: list[Standstill | Rejection]) -> None:
-        for found in results:
-            if isinstance(found, Standstill):
-                self.standstills.append(found)
+        for result in results:
+            if isinstance(result, Standstill):
+                self.standstills.append(result)
             else:
-                self.rejections.append(found)
+                self.rejections.append(result)
 
 
 # ── Messages out of a rosbag2 recording, one at a time, whatever its storage; rosbags does the reading ──────

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,8 @@ def shipped_robots() -> Sequence[str]:
 def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
     """See ``Robot.load``."""
     path = Path(source).expanduser()
-    if str(source) in shipped_robots():
+    shipped = str(source) in shipped_robots()
+    if shipped:
         path = config_folder() / "robots" / f"{source}.yaml"
     suffix = path.suffix.lower()
     if not path.is_file() or suffix not in (*YAML_SUFFIXES, *URDF_SUFFIXES):
@@ -61,6 +63,12 @@ def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: st
         if link is not None:
             advice = f"leave it out: {path.name} is one chain"
             raise InputError(field, repr(link), "no link beside a robot YAML, only beside a URDF", advice)
+    return _shipped_robot(path) if shipped else read_robot_yaml(path)
+
+
+@cache
+def _shipped_robot(path: Path) -> Robot:
+    """The robot of a file of the package, read and compiled once: robots are immutable."""
     return read_robot_yaml(path)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from calib_planner.acquisition import Offset
+from calib_planner.acquisition import NANO, Intake, Offset
 from calib_planner.identification import Estimate
 from calib_planner.io import UnavailableStore
 from calib_planner.ros.messages import stamp_message
@@ -51,6 +51,26 @@ class StreamHealth:
     lost: int
     reason: str
     offset: Offset | None = None
+
+
+def health(intake: Intake, now: int, seconds: float) -> list[StreamHealth]:
+    """Every stream of ``intake`` in the last ``seconds``, at the time ``now`` [ns]."""
+    detector, joints = intake.detector, intake.streams[0].last
+    return [
+        StreamHealth(
+            name=count.name,
+            rate=count.rate(seconds),
+            age=(now - count.last) / NANO if count.last else None,
+            skew=(joints - count.last) / NANO if count.last and joints else None,
+            messages=count.messages,
+            refused=count.refused,
+            late=0 if detector is None else detector.dropped[k],
+            lost=count.lost,
+            reason=count.reason,
+            offset=None if detector is None or k == 0 else detector.clocks.offset(k - 1),
+        )
+        for k, count in enumerate(intake.streams)
+    ]
 
 
 def diagnostics(

@@ -44,6 +44,12 @@ class Case:
         """Whether it needs measured data of real robots."""
         return any(needs_real(word) for word in self.words)
 
+    @property
+    def searched(self) -> bool:
+        """Whether the answer follows from a search for plans."""
+        words = self.words
+        return words[0] in SEARCHING or any(MADE.get(word, "").startswith("plan ") for word in words)
+
 
 # ── files that cases read ────────────────────────────────────────────────────────────────────────────
 
@@ -186,6 +192,7 @@ COMMANDS = (
     "demo",
     "reproduce",
 )
+SEARCHING = ("plan", "campaign", "compare", "demo", "reproduce")
 IRB = "--robot real/irb120_tracker/irb120.urdf"
 UR10 = "--robot real/ur10_tracker/ur10.urdf"
 SHEET = ("plan_sheet.html", "plan_sheet.csv", "plan_sheet.yaml", "trajectory.yaml")
@@ -234,7 +241,7 @@ def _plans() -> list[Case]:
         Case("plan_prove_offsets", f"{planar} --parameters offsets --configurations 2 --repetitions 2 --prove"),
         Case("plan_for_accuracy", f"{planar} --accuracy 3e-5 --starts 4"),
         Case("plan_of_measurements", f"{planar} --measurements 8 --starts 4"),
-        Case("plan_of_the_paper", f"{kuka} --configurations 3 --starts 4 --general-weight 0 --sigma 1e-4"),
+        Case("plan_of_the_paper", f"{small} {two} --general-weight 0 --sigma 1e-4"),
         Case("plan_configuration_sigma", f"{planar} --measurements 6 --starts 4 --configuration-sigma 2e-5"),
         Case("plan_named", f"{kuka} --parameters d1,q2,q3 --configurations 2 --starts 4"),
         Case("plan_lengths", f"{kuka} --parameters lengths --configurations 2 --starts 4"),

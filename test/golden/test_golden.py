@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
 
 import pytest
 from cases import CASES, REAL, Case
-from golden import EXPECTED, Inputs, answer, differences, kept, stored
+from golden import COARSE, EXACT, EXPECTED, SEARCHED, Inputs, Tolerance, answer, changes, differences, kept
 
 MOST_SHOWN = 20
 
@@ -21,15 +20,16 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 def test_users_get_the_same(case: Case, inputs: Inputs, tmp_path: Path) -> None:
     if case.real and not REAL.is_dir():
         pytest.skip(f"no measured data in {REAL}")
-    found = differences(stored(case.name), kept(answer(case, inputs, tmp_path)))
-    first = list(islice(found, MOST_SHOWN))
-    assert not first, "\n".join([f"calib-planner {case.line}", *first, "intended? python test/golden/update.py"])
+    found = changes(case, answer(case, inputs, tmp_path))
+    more = [f"… and {len(found) - MOST_SHOWN} more"] if len(found) > MOST_SHOWN else []
+    advice = f"intended? python test/golden/update.py {case.name}"
+    assert not found, "\n".join([f"calib-planner {case.line}", *found[:MOST_SHOWN], *more, advice])
 
 
 def test_every_expected_file_has_its_case() -> None:
     names = [c.name for c in CASES]
     assert len(set(names)) == len(names)
-    assert {p.stem for p in EXPECTED.glob("*.json")} == {*names, "nodes", "interfaces"}
+    assert {p.stem for p in EXPECTED.glob("*.json")} == {*names, "nodes", "interfaces", "arithmetic"}
 
 
 @pytest.mark.parametrize(
@@ -38,6 +38,9 @@ def test_every_expected_file_has_its_case() -> None:
         (1.0, 1.0 + 1e-13, True),
         (1.0, 1.0 + 1e-11, False),
         (0.0, 1e-30, False),
+        ({"std": 0.0}, {"std": 1e-15}, False),
+        ({"deviation": 0.0}, {"deviation": 1e-15}, True),
+        ({"deviation": 0.0}, {"deviation": 1e-13}, False),
         ([1.0, 0.0], [1.0, 1e-15], True),
         ([1.0, 0.0], [1.0, 1e-13], False),
         ([[1.0, 0.0], [0.0, 2.0]], [[1.0, 0.0], [1e-15, 2.0]], True),
@@ -59,6 +62,28 @@ def test_every_expected_file_has_its_case() -> None:
 )
 def test_what_counts_as_the_same(old: object, new: object, same: bool) -> None:
     assert (not list(differences(old, new))) == same
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "old", "new", "same"),
+    [
+        (COARSE, {"sigma": 1e-5}, {"sigma": 1.0001e-5}, True),
+        (COARSE, {"sigma": 1e-5}, {"sigma": 1.01e-5}, False),
+        (COARSE, {"status": "ok"}, {"status": "singular"}, False),
+        (SEARCHED, {"value": 1.0}, {"value": 1.1}, True),
+        (SEARCHED, {"value": 1.0}, {"value": 1.5}, False),
+        (SEARCHED, {"lower_bound": 1.0}, {"lower_bound": 1.1}, False),
+        (SEARCHED, {"configurations": [[1.0, 2.0]]}, {"configurations": [[3.0, 4.0]]}, True),
+        (SEARCHED, {"configurations": [[1.0, 2.0]]}, {"configurations": [[3.0]]}, False),
+        (SEARCHED, {"configurations": [1.0]}, {"configurations": [None]}, False),
+        (SEARCHED, {"bound": "proven"}, {"bound": "none"}, False),
+    ],
+)
+def test_what_counts_as_the_same_on_another_machine(
+    tolerance: Tolerance, old: object, new: object, same: bool
+) -> None:
+    assert (not list(differences(old, new, tolerance))) == same
+    assert list(differences(old, new, EXACT))
 
 
 def test_long_lists_are_summed_without_losing_an_entry() -> None:

@@ -12,15 +12,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cases import CASES, REAL
-from golden import EXPECTED, Inputs, answer, differences, kept, store, stored
+from golden import EXPECTED, Inputs, answer, arithmetic, differences, kept, same_arithmetic, store, stored
+
+OTHERS = ("nodes", "interfaces", "arithmetic")
 
 
 def main(names: Sequence[str]) -> int:
     """Rewrite the expected files of these names, or of all."""
-    known = [*(c.name for c in CASES), "nodes", "interfaces"]
+    known = [*(c.name for c in CASES), *OTHERS]
     if unknown := [name for name in names if name not in known]:
         print(f"update.py: no case {unknown[0]!r}; valid: {', '.join(known)}", file=sys.stderr)
         return 2
+    if names and not same_arithmetic():
+        print(
+            "update.py: this machine's last digits are not those of expected/: rewrite all of it", file=sys.stderr
+        )
+        return 1
     with tempfile.TemporaryDirectory() as folder:
         inputs = Inputs(_made(Path(folder) / "inputs"))
         for case in CASES:
@@ -34,6 +41,8 @@ def main(names: Sequence[str]) -> int:
         for path in EXPECTED.glob("*.json"):
             if path.stem not in known:
                 path.unlink()
+    if not names:
+        _write("arithmetic", arithmetic())
     if not names or "interfaces" in names:
         from surface import interfaces
 

@@ -108,9 +108,9 @@ def best_worth_of_search(space: PlanSpace, support: np.ndarray, weights: np.ndar
 # ── no plan beats its bound ──────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("block", range(10))
+@pytest.mark.parametrize("block", range(5))
 def test_no_plan_of_a_random_chain_beats_its_bound(block):
-    """Two hundred random problems: chains, parameters, criteria, priors, repetitions."""
+    """A hundred random problems: chains, parameters, criteria, priors, repetitions."""
     done = 0
     for seed in range(20 * block, 20 * block + 20):
         try:
@@ -162,12 +162,12 @@ def test_equation_20_to_the_tolerance_of_the_proof():
         assert 1.0 - 1e-12 <= ceiling * (1 + abs(np.sin(q0[1]))) / m <= 1.0 + 1e-7
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_plan_of_the_kuka_beats_its_bound(seed):
     """Random test poses: the plan searched for, and random ones."""
     robot = Robot.load("kuka_kr270")
     q0 = random_configurations(robot, 1, seed)
-    m = (3, 4, 6, 12)[seed % 4]
+    m = (3, 4, 6, 12)[seed]
     found = plan(PlanProblem(robot, q0, m, starts=4, general_weight=0.0, seed=seed), prove=True)
     assert found.bound == "proven"
     assert "proven to" in found.message

@@ -79,7 +79,7 @@ class Shift:
     @property
     def fed(self) -> int:
         """Messages that the node took."""
-        return sum(w.messages for w in self.node._intake.watches)
+        return sum(w.messages for w in self.node._intake.streams)
 
     def send(self, publisher: Any, message: Any, ahead: int = 100) -> None:
         """Publish, and wait until all but the last ``ahead`` messages were taken."""

@@ -12,13 +12,12 @@ from sensor_msgs.msg import JointState
 from test_campaign_goes_on import HOW, PLAN, ROBOT, begun, measure, opened, seen
 
 from calib_planner import Estimate
-from calib_planner.acquisition import NANO, Offset, StandstillSettings
+from calib_planner.acquisition import NANO, Intake, JointReader, Offset, StandstillSettings, StreamCount
 from calib_planner.errors import InputError, StoreError
 from calib_planner.io import StoredModel, UnavailableStore
-from calib_planner.ros.diagnostics import StreamHealth, diagnostics
+from calib_planner.ros.diagnostics import StreamHealth, diagnostics, health
 from calib_planner.ros.messages import joints_message, point_message, stamp_message
 from calib_planner.ros.session import Campaign
-from calib_planner.ros.streams import Intake, JointReader, StreamWatch
 
 GOOD = StreamHealth("joint_states", 1000.0, 0.002, 0.0, 5000, 0, 0, 0, "")
 POINT = replace(GOOD, name="tracker/point", skew=0.001, offset=Offset(0.004, 0.001, 9))
@@ -115,23 +114,23 @@ def test_counts_rates_ages_and_skews() -> None:
         streams.joints(joints_message(("b", "a"), np.array([2.0, 1.0]), (100 + k) * NANO))
         streams.point(0, point_message(np.zeros(3), (98 + k) * NANO, "laser"))
     streams.point(0, point_message(np.zeros(3), 0, ""))
-    streams.watches[1].lost += 3
-    first, second, silent = streams.health(110 * NANO, 2.0)
+    streams.streams[1].lost += 3
+    first, second, silent = health(streams, 110 * NANO, 2.0)
     assert (first.name, first.rate, first.age, first.skew, first.messages) == ("joint_states", 5.0, 1.0, 0.0, 10)
     assert (second.rate, second.age, second.skew, second.refused, second.lost) == (5.5, 3.0, 2.0, 1, 3)
     assert "stamp" in second.reason and streams.frame == "laser"
     assert (silent.rate, silent.age, silent.skew) == (0.0, None, None)
-    assert streams.health(110 * NANO, 2.0)[0].rate == 0.0
+    assert health(streams, 110 * NANO, 2.0)[0].rate == 0.0
 
 
 def test_without_a_robot_messages_are_only_counted() -> None:
     streams = intake(None)
     assert streams.joints(JointState(header=joints_message((), np.zeros(0), NANO).header)) == []
     assert streams.point(1, point_message(np.zeros(3), NANO, "")) == []
-    assert [w.messages for w in streams.watches] == [1, 0, 1] and streams.offset_text(0.1) == ""
+    assert [w.messages for w in streams.streams] == [1, 0, 1] and streams.offset_text(0.1) == ""
     streams.use(("a",))
     streams.joints(joints_message(("a",), np.zeros(1), NANO))
-    assert streams.watches[0].messages == 2 and streams.detector is not None
+    assert streams.streams[0].messages == 2 and streams.detector is not None
 
 
 def test_the_reader_follows_names_that_change() -> None:
@@ -176,10 +175,10 @@ def test_nonsense_gives_no_standstill() -> None:
         point.point.x, point.point.y, point.point.z = rng.choice(numbers, 3).tolist()
         point.header.stamp = stamp
         streams.point(int(rng.integers(2)), point)
-    assert streams.watches[0].messages == 3000 and streams.health(0, 1.0)
+    assert streams.streams[0].messages == 3000 and health(streams, 0, 1.0)
 
 
 def test_a_stamp_before_the_epoch() -> None:
-    watch = StreamWatch("x")
-    assert not watch.usable(-5) and not watch.usable(0) and watch.usable(1)
-    assert (watch.messages, watch.refused, watch.newest, watch.reason) == (3, 2, 1, "")
+    watch = StreamCount("x")
+    assert not watch.stamped(-5) and not watch.stamped(0) and watch.stamped(1)
+    assert (watch.messages, watch.refused, watch.last, watch.reason) == (3, 2, 1, "")

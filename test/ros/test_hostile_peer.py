@@ -101,7 +101,7 @@ class Cell:
         )
         assert read.values[0].string_value == "planar_2r"
         assert all(node.is_active for node in (self.planner, self.identifier, self.simulator))
-        for watch in self.identifier._intake.watches:
+        for watch in self.identifier._intake.streams:
             heard = watch.messages
             self.bench.wait(lambda w=watch, n=heard: w.messages > n)
         assert sorted(p.name for p in self.outside.iterdir()) == ["secret.txt"]

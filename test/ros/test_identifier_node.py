@@ -164,7 +164,7 @@ def test_messages_without_a_stamp_are_refused_with_a_reason(shift: Shift, planne
     state = JointState(name=["q1", "q2"], position=[0.0, 0.0])
     state.header.stamp = Time(sec=stamp // NANO)
     shift.send(shift.joints, state)
-    shift.bench.wait(lambda: "stamp" in shift.node._intake.watches[0].reason)
+    shift.bench.wait(lambda: "stamp" in shift.node._intake.streams[0].reason)
     assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
 
 
@@ -246,7 +246,7 @@ def test_two_targets(bench: Bench) -> None:
     robot = Robot.load("planar_2r").with_targets(np.zeros((2, 3))).with_parameters("lengths+offsets", ["tool"])
     bench.start(IdentifierNode, robot="planar_2r", unknown="tool", tracker_topics=["a", "b"])
     assert len(robot.targets) == 2 and len(bench.nodes[0]._campaign.robot.targets) == 2
-    assert {w.name for w in bench.nodes[0]._intake.watches} == {"joint_states", "a", "b"}
+    assert {w.name for w in bench.nodes[0]._intake.streams} == {"joint_states", "a", "b"}
 
 
 def test_simulated_time_that_stands_still_stops_nothing(bench: Bench, robot: Robot, planned: Plan) -> None:

@@ -20,12 +20,12 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from calib_planner import __version__
-from calib_planner.acquisition import Rejection, Standstill
+from calib_planner.acquisition import Intake, Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.identification import Estimate
 from calib_planner.io import ACCEPTED, Decision, UnavailableStore, calibrated_urdf, open_store
 from calib_planner.ros import session
-from calib_planner.ros.diagnostics import diagnostics
+from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import (
     ESTIMATE_STATUS,
@@ -41,7 +41,6 @@ from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.session import Campaign, Matching, TooFew, condition_of
 from calib_planner.ros.settings import IdentifierParameters
-from calib_planner.ros.streams import Intake
 from calib_planner.units import brief, cut
 
 
@@ -109,9 +108,10 @@ class IdentifierOutput:
 
 
 # ── Node ``calibration_identifier``: hears joints and tracker points, publishes the calibrated parameters ───
-# Standstills are found in ``streams``, matched to the plan, stored and identified in ``campaign``, saved in
-# ``saving``; this file only carries messages. All callbacks take turns in one thread: a standstill costs a commit
-# to disk and an identification, some 20 ms together, for which the queues of the streams are deep enough by far.
+# Standstills are found in ``acquisition.Intake``, matched, stored and identified in ``session``, which
+# saves them, too; this file only carries messages. All callbacks take turns in one thread: a standstill costs a
+# commit to disk and an identification, some 20 ms together, for which the queues of the streams are deep enough
+# by far.
 #
 # A measurement is acknowledged on ``~/measurements`` after it is on the disk. As long as that cannot be written,
 # standstills are rejected as not stored and the node goes on; the next standstill tries again.
@@ -287,7 +287,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
 
     def _on_lost(self, stream: int, count: int) -> None:
         if self._intake is not None:
-            self._intake.watches[stream].lost += count
+            self._intake.streams[stream].lost += count
 
     # ── what goes out ────────────────────────────────────────────────────────────────────────────────
 
@@ -349,9 +349,9 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self._withdraw_misdated()
         if intake is not None:
             now, seconds = self.get_clock().now().nanoseconds, chosen.diagnostics_period
-            health = intake.health(now, seconds)
+            streams = health(intake, now, seconds)
             name = self.get_fully_qualified_name().strip("/")
-            message = diagnostics(name, now, health, chosen.clock_offset, self._campaign, self._waiting)
+            message = diagnostics(name, now, streams, chosen.clock_offset, self._campaign, self._waiting)
             self._output.diagnostics(message)
 
     def _reopen(self) -> None:
