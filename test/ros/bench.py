@@ -118,16 +118,17 @@ class Bench:
         self.nodes.append(node)
         self._spin(node, getattr(kind, "THREADS", 1))
         if isinstance(node, ManagedNode) and node.settings.value.autostart:
-            self.wait(lambda: node.autostarted, 30.0)
+            self.wait(lambda: node.autostarted)
         return node
 
-    def wait(self, condition: Callable[[], Any], seconds: float = 15.0) -> None:
+    def wait(self, condition: Callable[[], Any], seconds: float = 60.0) -> None:
+        """Until ``condition``; ``seconds`` are what a busy machine may take, not what is expected."""
         deadline = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < deadline, f"not within {seconds} s"
             time.sleep(0.005)
 
-    def future(self, future: Any, seconds: float = 15.0) -> Any:
+    def future(self, future: Any, seconds: float = 60.0) -> Any:
         self.wait(future.done, seconds)
         return future.result()
 
@@ -169,7 +170,7 @@ class Bench:
         for _ in range(3):
             sent = client.send_goal_async(goal, **options)
             try:
-                handle = self.future(sent, 5.0)
+                handle = self.future(sent, 20.0)
             except AssertionError:
                 continue
             assert handle.accepted

@@ -48,7 +48,7 @@ class Desk:
         """A first call may be answered before discovery has matched its reader: then it is repeated."""
         client = self.clients[name]
         self.bench.wait(client.service_is_ready)
-        for _ in range(3):
+        for _ in range(6):
             future = client.call_async(Trigger.Request())
             try:
                 response = self.bench.future(future, 5.0)
@@ -62,7 +62,7 @@ class Desk:
     def now(self) -> CampaignStatus:
         return self.heard[-1]
 
-    def until(self, state: int, seconds: float = 30.0, said: str = "", **counts: int) -> CampaignStatus:
+    def until(self, state: int, seconds: float = 60.0, said: str = "", **counts: int) -> CampaignStatus:
         """The first status from the newest one on in that state, with these words and at least these counts."""
         begin, found = len(self.heard) - 1, list[CampaignStatus]()
 
