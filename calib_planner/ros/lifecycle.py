@@ -26,6 +26,7 @@ from rclpy.action import ActionClient, ActionServer
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -112,8 +113,15 @@ class ManagedNode(LifecycleNode, Generic[P]):
 
     @property
     def state(self) -> str:
-        """``unconfigured``, ``inactive``, ``active``, ``finalized`` or the name of a transition."""
-        return str(self._state_machine.current_state[1])
+        """``unconfigured``, ``inactive``, ``active``, ``finalized`` or the name of a transition.
+
+        A destroyed node is ``finalized``; a thread that it left behind may ask.
+        """
+        try:
+            with self._state_machine:
+                return str(self._state_machine.current_state[1])
+        except InvalidHandle:
+            return "finalized"
 
     @property
     def is_active(self) -> bool:

@@ -101,9 +101,11 @@ class Bench:
         self.stopping = True
         for executor, thread in self._spinning:
             executor.wake()
-            thread.join(timeout=10.0)
+            thread.join(timeout=60.0)
         for executor, _ in self._spinning:
             executor.shutdown()
+            if isinstance(executor, MultiThreadedExecutor):
+                executor._executor.shutdown()  # rclpy leaves its threads at work on what is destroyed next
         for client in self.actions:
             client.destroy()
         # Without this the DDS participant lives on: beyond some 30 of them discovery fails.
