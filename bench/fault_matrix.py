@@ -35,6 +35,7 @@ from calib_planner.acquisition import Rejection, Standstill, StandstillDetector,
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import CalibPlannerError
 from calib_planner.identification import Estimate
+from calib_planner.planning import Search
 from calib_planner.robot import analyse
 from calib_planner.simulation import Faults, SimulatedCell, World, make_tour, play, random_deviations
 
@@ -138,7 +139,7 @@ def robot_and_visits(setup: str, seed: int) -> tuple[Robot, FloatArray, IntArray
 
 def _planned(robot: Robot) -> tuple[FloatArray, IntArray]:
     if not _PLANNED:
-        found = plan(PlanProblem(robot, POSE, configurations=12, starts=8, sigma=SIGMA / 20**0.5))
+        found = plan(PlanProblem(robot, POSE, configurations=12, noise=SIGMA / 20**0.5, search=Search(starts=8)))
         _PLANNED.append(found.configurations)
     return _PLANNED[0], np.full(len(_PLANNED[0]), 2)
 

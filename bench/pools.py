@@ -29,7 +29,7 @@ from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.identification import start_robot
 from calib_planner.io import read_measurements
-from calib_planner.planning import PlanProblem, plan
+from calib_planner.planning import Candidates, PlanProblem, plan
 from calib_planner.planning.bound import relax_pool
 from calib_planner.planning.criteria import Determinant
 from calib_planner.planning.search.exchange import PoolProblem, choose
@@ -119,7 +119,7 @@ def compare(robot: Robot, q: FloatArray, python: str | None, repeats: int) -> di
             entry["d_ratio"] = float(np.exp((entry["log_det"] - entry["figaroh_log_det"]) / rows.shape[2]))
         result["choices"].append(entry)
     began = time.perf_counter()
-    plan(PlanProblem(robot, None, 20, criterion="d", candidates=q))
+    plan(PlanProblem(robot, None, 20, criterion="d", candidates=Candidates(q)))
     result["plan_seconds_n20"] = time.perf_counter() - began
     return result
 

@@ -27,7 +27,7 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.identification import start_robot
 from calib_planner.io import read_measurements
 from calib_planner.measurements import Measurements
-from calib_planner.planning import ModelDiscrepancy, PlanProblem, plan
+from calib_planner.planning import Candidates, ModelDiscrepancy, PlanProblem, plan
 from calib_planner.tracker import Isotropic
 
 COUNTS = (10, 15, 20, 30)
@@ -94,7 +94,9 @@ def planners(robot: Robot, discrepancy: ModelDiscrepancy) -> dict[str, Callable[
     def ask(**options: Any) -> Callable[[FloatArray, int], FloatArray]:
         def choose(pool: FloatArray, n: int) -> FloatArray:
             poses = None if options.get("criterion") == "d" else pool
-            return plan(PlanProblem(robot, poses, n, candidates=pool, sigma=SIGMA, **options)).configurations
+            return plan(
+                PlanProblem(robot, poses, n, noise=SIGMA, **options, candidates=Candidates(pool))
+            ).configurations
 
         return choose
 

@@ -49,6 +49,7 @@ from sensor_msgs.msg import JointState
 from calib_planner import PlanProblem, Robot, __version__, plan
 from calib_planner.acquisition import NANO, Standstill
 from calib_planner.io import open_store
+from calib_planner.planning import Search
 from calib_planner.ros.messages import stamp_message
 from calib_planner.ros.model import first_model
 from calib_planner.ros.processes import Nodes, own_domain
@@ -112,7 +113,9 @@ def prepare(chosen: argparse.Namespace, folder: Path, more: int) -> tuple[np.nda
     low, high = robot.joint_limits.T
     q = rng.uniform(low, high, (stored + more, len(low)))
     points = real.positions(q + chosen.erring * rng.standard_normal(q.shape))[:, 0]
-    promised = plan(PlanProblem(robot.with_parameters("lengths+offsets"), [q[0]], 5, sigma=SIGMA, starts=1))
+    promised = plan(
+        PlanProblem(robot.with_parameters("lengths+offsets"), [q[0]], 5, noise=SIGMA, search=Search(starts=1))
+    )
     found = replace(promised, configurations=q, repetitions=np.ones(len(q), dtype=int))
     store = open_store(str(folder), model.stored, asdict(settings), __version__)
     campaign = Campaign(model.robot, model.follow, store)

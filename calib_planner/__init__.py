@@ -7,8 +7,9 @@ Nothing here needs ROS; the nodes live in ``calib_planner.ros``. A name is impor
 used, so that a program pays only for what it needs.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from calib_planner.doors import lazy_door
 
 if TYPE_CHECKING:
     from calib_planner.errors import (
@@ -22,28 +23,27 @@ if TYPE_CHECKING:
     from calib_planner.identification import Estimate, IdentificationProblem, identify, validate
     from calib_planner.io import Robot
     from calib_planner.measurements import Measurements
-    from calib_planner.planning import Plan, PlanProblem, Progress, plan
+    from calib_planner.planning import (
+        Candidates,
+        Plan,
+        PlanPrior,
+        PlanProblem,
+        PlanQuality,
+        Progress,
+        Search,
+        plan,
+    )
 
 __version__ = "0.1.0"
 
-_ROOMS = {
-    "errors": "CalibPlannerError FileFormatError InfeasibleError InputError NotEnoughDataError UnknownNameError",
-    "identification": "Estimate IdentificationProblem identify validate",
-    "io": "Robot",  # ``Robot.load`` reads files, which is what ``io`` teaches it
-    "measurements": "Measurements",
-    "planning": "Plan PlanProblem Progress plan",
-}
-_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names.split()}
-
-__all__ = [*_ROOM_OF]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _ROOM_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__, __all__ = lazy_door(
+    __name__,
+    {
+        "errors": "CalibPlannerError FileFormatError InfeasibleError InputError NotEnoughDataError "
+        "UnknownNameError",
+        "identification": "Estimate IdentificationProblem identify validate",
+        "io": "Robot",  # ``Robot.load`` reads files, which is what ``io`` teaches it
+        "measurements": "Measurements",
+        "planning": "Candidates Plan PlanPrior PlanProblem PlanQuality Progress Search plan",
+    },
+)

@@ -26,6 +26,22 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     return copy
 
 
+def plain(value: Any, *, keep_infinite: bool = False, keep_nan: bool = False) -> Any:
+    """What JSON and YAML can hold: arrays and tuples as lists, NumPy's numbers as Python's, recursively.
+
+    Numbers that are not finite become ``None``, unless they are to be kept.
+    """
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(k): plain(v, keep_infinite=keep_infinite, keep_nan=keep_nan) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v, keep_infinite=keep_infinite, keep_nan=keep_nan) for v in value]
+    if not isinstance(value, float) or np.isfinite(value):
+        return value
+    return value if (keep_nan if np.isnan(value) else keep_infinite) else None
+
+
 def check_array(
     field: str,
     value: ArrayLike,

@@ -12,11 +12,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.io import write_estimate, write_measurements, write_plan, write_text
-from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, error_variance, plain, plan
+from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, Search, error_variance, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -66,9 +66,8 @@ def run_demo(
         [TEST_POSE],
         settings.configurations,
         settings.repetitions,
-        sigma=settings.sigma,
-        starts=settings.starts,
-        seed=settings.seed,
+        noise=settings.sigma,
+        search=Search(starts=settings.starts, seed=settings.seed),
     )
     found = plan(problem, callback)
     truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)
@@ -210,7 +209,7 @@ def demo_report(
     """Compare an estimate with the truth, and the plan with random ones.
 
     Args:
-        problem: What was planned; its ``sigma`` is the noise of the random comparison.
+        problem: What was planned; its ``noise`` is the noise of the random comparison.
         plan: What was measured.
         estimate: What was identified.
         truth: True deviation of each parameter [m | rad].
@@ -218,7 +217,7 @@ def demo_report(
         report: Folder named in the result.
     """
     robot, poses = problem.robot, problem.test_pose_array
-    cell = SimulatedCell(robot, truth, problem.sigma)
+    cell = SimulatedCell(robot, truth, problem.instrument.typical)
     found = dict(zip(estimate.parameters, map(float, estimate.deviations), strict=True))
     std = dict(zip(estimate.parameters, map(float, estimate.std), strict=True))
     missing = [p.name for p in robot.parameters if p.name not in found]
@@ -229,10 +228,10 @@ def demo_report(
         robot=robot.name,
         configurations=len(plan.configurations),
         measurements=plan.measurements,
-        sigma=problem.sigma,
+        sigma=problem.instrument.typical,
         before=_rms(cell.position_errors(robot, poses)),
         after=_rms(cell.position_errors(robot.with_deviations(found), poses)),
-        predicted_accuracy=plan.predicted_accuracy,
+        predicted_accuracy=plan.quality.predicted_accuracy,
         random_after=random_after,
         random_predicted_accuracy=random_accuracy,
         random_plans=random_plans,
@@ -261,7 +260,7 @@ def _random_plans(problem: PlanProblem, cell: SimulatedCell, seed: int, count: i
         q = rng.uniform(low, high, (problem.configurations, len(low)))
         predicted.append(_accuracy(robot, q, problem))
         data = cell.measure(q, problem.repetitions, int(rng.integers(2**31)))
-        estimate = identify(IdentificationProblem(robot, data, sigma=problem.sigma))
+        estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
         after.append(_rms(cell.position_errors(estimate.calibrated, poses)))
     return _rms(np.array(after)), _rms(np.array(predicted))
 

@@ -72,7 +72,12 @@ def plan_of(robot: Robot, configurations: np.ndarray, repetitions: int = 1, **ch
         "starts": 1,
         "evaluations": 1,
     }
-    return Plan(**{**values, **changes})  # type: ignore[arg-type]
+    return Plan.from_values({**values, **changes})
+
+
+def changed(plan: Plan, **changes: object) -> Plan:
+    """The plan with other values of its own or of its quality."""
+    return Plan.from_values({**plan.values(), **changes})
 
 
 CASES = {

@@ -27,7 +27,7 @@ PAPER = ROOT / "paper" / "calib_planner_paper"
 
 # ── the rooms ────────────────────────────────────────────────────────────────────────────────────────
 
-GROUND = ("errors", "arrays", "units", "measurements")
+GROUND = ("doors", "errors", "arrays", "units", "measurements")
 """Single files that every room may use; each uses only those before it."""
 ROOMS: dict[str, str] = {
     "robot": "",
@@ -45,7 +45,7 @@ ROOMS: dict[str, str] = {
     "ros": "robot tracker acquisition planning identification campaign simulation io report demo",
 }
 """Room → the rooms that it may use besides ``GROUND``, in the order of the house: each only rooms above it."""
-FRONT = {"": "errors measurements planning identification io", "__main__": "cli"}
+FRONT = {"": "doors errors measurements planning identification io", "__main__": "cli"}
 """The package's own door, which resolves names when they are first used, and ``python -m calib_planner``."""
 PAPER_USES = "robot tracker planning identification simulation io cli"
 WITHOUT_A_DOOR = ("ros",)
@@ -313,8 +313,7 @@ LEFT_NAMES = {
     "planning": 162,
     "campaign": 40,
     "simulation": 3,
-    "io": 34,
-    "report": 16,
+    "io": 32,
     "demo": 3,
     "cli": 17,
     "ros": 37,
@@ -329,10 +328,9 @@ LEFT_TEXT = {
     "compensation": 2,
     "campaign": 19,
     "simulation": 5,
-    "io": 15,
-    "report": 12,
+    "io": 14,
     "cli": 7,
-    "ros": 17,
+    "ros": 14,
     "paper": 4,
     "docs": 71,
     "msg_defs": 7,

@@ -13,7 +13,17 @@ from calib_planner.campaign.problem import AwayFrom, distances
 from calib_planner.campaign.state import FIT, CampaignState, Decision, Stop
 from calib_planner.errors import InfeasibleError
 from calib_planner.identification import FEWEST_SPARE
-from calib_planner.planning import Feasibility, PlanProblem, plan, plan_space, smallest_size, visiting_order
+from calib_planner.planning import (
+    Candidates,
+    Feasibility,
+    PlanPrior,
+    PlanProblem,
+    Search,
+    plan,
+    plan_space,
+    smallest_size,
+    visiting_order,
+)
 
 REPEATED = 4
 """Configurations of the first batch measured twice: 12 degrees of freedom for the noise of one target."""
@@ -39,8 +49,8 @@ def next_batch(state: CampaignState, found: Finding | None, stopped: Callable[[]
     twice = _spread(queue, min(repeated, allowed - len(q)))
     stops = tuple(Stop(row, FIT, 1 + (first + k in twice)) for k, row in enumerate(q))
     left = _left(state, found, allowed)
-    if found is None and np.isfinite(made.predicted_accuracy):
-        share = max(made.predicted_accuracy / problem.required_accuracy, 0.0) ** 2
+    if found is None and np.isfinite(made.quality.predicted_accuracy):
+        share = max(made.quality.predicted_accuracy / problem.required_accuracy, 0.0) ** 2
         left = max(float(np.ceil(len(q) * share)), float(len(q) + len(twice)))
     total = len(queue) + len(twice)
     text = f"{total} measurements planned"
@@ -63,12 +73,11 @@ def plan_problem(state: CampaignState, found: Finding | None) -> PlanProblem:
         1,
         noise=problem.instrument if found is None else found.noise,
         criterion="test_pose" if len(poses) == 1 else "worst_pose",
-        prior_std=std,
-        measured=None if found is None else found.used,
         constraints=constraints,
-        starts=problem.starts,
-        seed=problem.seed + len(state.rounds),
-        time_limit=problem.time_limit,
+        prior=PlanPrior(std=std, measured=None if found is None else found.used),
+        search=Search(
+            starts=problem.starts, seed=problem.seed + len(state.rounds), time_limit=problem.time_limit
+        ),
     )
 
 
@@ -100,7 +109,9 @@ def _sized(request: PlanProblem, size: int, state: CampaignState, found: Finding
         return replace(request, configurations=size)
     rng = np.random.default_rng([state.problem.seed, len(state.rounds), 3])
     pool = Feasibility(request.robot, request.constraints).sample(rng, POOL)
-    return replace(request, configurations=size, criterion="test_pose", candidates=pool, discrepancy=discrepancy)
+    return replace(
+        request, configurations=size, criterion="test_pose", candidates=Candidates(pool), discrepancy=discrepancy
+    )
 
 
 def _to_repeat(state: CampaignState, count: int) -> tuple[int, ...]:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib_planner.arrays import FloatArray, check_count, check_number, frozen
+from calib_planner.arrays import FloatArray, check_count, check_number, frozen, plain
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import Estimate, IdentificationProblem, Verdict
 from calib_planner.measurements import Measurements
-from calib_planner.planning import Constraint, PlanProblem, plain
+from calib_planner.planning import Constraint, PlanProblem, Search
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
 
@@ -85,11 +85,13 @@ class CampaignProblem:
             self.robot,
             self.test_poses,
             1,
-            noise=self.noise,
+            noise=self.instrument,
             constraints=self.constraints,
-            starts=self.starts,
-            seed=check_count("seed", self.seed, low=0, high=2**31 - 1),
-            time_limit=self.time_limit,
+            search=Search(
+                starts=self.starts,
+                seed=check_count("seed", self.seed, low=0, high=2**31 - 1),
+                time_limit=self.time_limit,
+            ),
         )
         put(self, "test_poses", checked.test_pose_array)
         put(self, "constraints", checked.constraints)

@@ -4,19 +4,15 @@
 imported when they are first used, so that ``--help`` does not pay for them.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from calib_planner.cli.main import main
+from calib_planner.doors import lazy_door
 
 if TYPE_CHECKING:
     from calib_planner.cli.arguments import Commands, add_command, add_seed
     from calib_planner.cli.terminal import Terminal
 
-__all__ = ["Commands", "Terminal", "add_command", "add_seed", "main"]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{'terminal' if name == 'Terminal' else 'arguments'}"), name)
+__getattr__, __dir__, __all__ = lazy_door(
+    __name__, {"arguments": "Commands add_command add_seed", "terminal": "Terminal"}, "main"
+)

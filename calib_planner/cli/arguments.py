@@ -10,8 +10,9 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InputError
-from calib_planner.io import angle_factors, read_configurations, read_constraints, read_instrument
+from calib_planner.io import angle_factors, read_configurations
 from calib_planner.robot import Robot
+from calib_planner.tracker import Isotropic
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
 
@@ -147,10 +148,13 @@ def add_conditions(parser: argparse._ActionsContainer) -> None:
 
 
 def conditions(args: argparse.Namespace, robot: Robot) -> dict[str, Any]:
-    """The arguments of ``PlanProblem`` that ``add_conditions`` is about."""
-    found: dict[str, Any] = {"sigma": args.sigma}
-    if args.instrument is not None:
-        found["noise"] = read_instrument(args.instrument)
+    """The fields of ``PlanProblem`` that ``add_conditions`` is about."""
+    # Planning, 0.2 s, is imported for these files only.
+    from calib_planner.io import read_constraints, read_instrument
+
+    result: dict[str, Any] = {}
     if args.constraints is not None:
-        found["constraints"] = read_constraints(args.constraints, robot)
-    return found
+        result["constraints"] = read_constraints(args.constraints, robot)
+    return result | {
+        "noise": Isotropic(args.sigma) if args.instrument is None else read_instrument(args.instrument)
+    }

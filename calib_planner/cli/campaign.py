@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray, check_count, check_number
+from calib_planner.arrays import FloatArray, check_count, check_number, plain
 from calib_planner.campaign import (
     FIT,
     OUTCOMES,
@@ -45,7 +45,6 @@ from calib_planner.errors import InputError
 from calib_planner.identification import AUTOMATIC
 from calib_planner.io import read_measurements, write_configurations, write_estimate, write_measurements
 from calib_planner.measurements import Measurements
-from calib_planner.planning import plain
 from calib_planner.robot import Robot
 from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations, simulated
 from calib_planner.units import counted, length
@@ -145,6 +144,7 @@ def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
         poses,
         args.required_accuracy,
         **{name: getattr(args, name) for name in NUMBERS},
+        sigma=args.sigma,
         **conditions(args, robot),
         identification={"joint_corrections": args.joint_corrections},
         starts=args.starts,

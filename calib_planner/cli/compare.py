@@ -43,7 +43,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     result = {
         "robot": problem.robot.name,
         "sigma": problem.instrument.typical,
-        "seed": problem.seed,
+        "seed": problem.search.seed,
         "columns": [column.to_dict() for column in columns],
     }
     terminal.answer(result, partial(show_comparison, columns))
@@ -66,8 +66,8 @@ def show_comparison(columns: list[Comparison], console: Console) -> None:
         "random, max": [c.random.max() for c in columns],
         "random, min": [c.random.min() for c in columns],
         "random, mean": [c.random.mean() for c in columns],
-        "proposed": [c.proposed.predicted_accuracy for c in columns],
-        "lower bound": [c.proposed.lower_bound for c in columns],
+        "proposed": [c.proposed.quality.predicted_accuracy for c in columns],
+        "lower bound": [c.proposed.quality.lower_bound for c in columns],
     }
     for label, values in rows.items():
         table.add_row(label, *(f"{1e6 * v:.4g}" for v in values))

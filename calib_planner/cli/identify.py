@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib_planner.acquisition import StandstillSettings
-from calib_planner.arrays import IntArray
+from calib_planner.arrays import IntArray, plain
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
@@ -55,7 +55,6 @@ from calib_planner.io import (
     write_kinematics,
 )
 from calib_planner.measurements import Measurements
-from calib_planner.planning import plain
 from calib_planner.report import Provenance, provenance, write_report
 from calib_planner.robot import Robot, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise

@@ -41,10 +41,13 @@ from calib_planner.io import (
 from calib_planner.planning import (
     CRITERIA,
     POSE_CRITERIA,
+    Candidates,
     ModelDiscrepancy,
     Plan,
+    PlanPrior,
     PlanProblem,
     Progress,
+    Search,
     Split,
     plan_for_accuracy,
     plan_sheet,
@@ -100,7 +103,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         _write(args.output, found)
     if args.sheet:
         sheet = plan_sheet(
-            found, problem.robot, problem.constraints, problem.noise, pace=robot_pace(problem.robot)
+            found, problem.robot, problem.constraints, problem.instrument, pace=robot_pace(problem.robot)
         )
         write_sheet(args.sheet, sheet, terminal, "--sheet")
     result = found.to_dict() | (_tried(split) if split else {})
@@ -129,7 +132,7 @@ def _tried(split: Split) -> dict[str, Any]:
         {
             "configurations": len(p.configurations),
             "repetitions": int(p.repetitions[0]),
-            "predicted_accuracy": p.value,
+            "predicted_accuracy": p.quality.value,
         }
         for p in split.tried
     ]
@@ -156,7 +159,7 @@ def _write(output: str, found: Plan) -> None:
 
 # ── The arguments that make a plan problem, shared by ``plan`` and ``compare`` ──────────────────────────────
 
-DEFAULTS = {name: field.default for name, field in PlanProblem.__dataclass_fields__.items()}
+USUAL = Search()
 
 
 def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argparse._ArgumentGroup:
@@ -189,16 +192,17 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     )
     known.add_argument("--measured", metavar="FILE", help="CSV of measurements already taken: plan the next ones")
     search = parser.add_argument_group("search")
-    weight = DEFAULTS["general_weight"]
     search.add_argument(
         "--general-weight",
         type=float,
-        default=weight,
+        default=USUAL.general_weight,
         metavar="W",
-        help=f"share of the criterion for accuracy everywhere, 0 … 1 ({weight:g}; 0 is the paper's)",
+        help="share of the criterion for accuracy everywhere, 0 … 1 "
+        f"({USUAL.general_weight:g}; 0 is the paper's)",
     )
-    starts = DEFAULTS["starts"]
-    search.add_argument("--starts", type=int, default=starts, metavar="N", help=f"random starts ({starts})")
+    search.add_argument(
+        "--starts", type=int, default=USUAL.starts, metavar="N", help=f"random starts ({USUAL.starts})"
+    )
     search.add_argument("--time-limit", type=float, default=float("inf"), metavar="S", help="seconds (none)")
     add_seed(search)
     return work
@@ -254,16 +258,13 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         **conditions(args, robot),
         criterion=criterion,
         compound=_compound(getattr(args, "compound", [])),
-        general_weight=args.general_weight,
-        configuration_sigma=args.configuration_sigma,
-        prior_std=_prior(args.prior, robot),
-        measured=_measured(args, robot),
-        candidates=_candidates(args, robot),
+        repeatability=args.configuration_sigma,
         discrepancy=_discrepancy(args, robot),
-        repeat_candidates=getattr(args, "repeat_candidates", False),
-        starts=args.starts,
-        seed=args.seed,
-        time_limit=args.time_limit,
+        prior=PlanPrior(std=_prior(args.prior, robot), measured=_measured(args, robot)),
+        search=Search(
+            general_weight=args.general_weight, starts=args.starts, seed=args.seed, time_limit=args.time_limit
+        ),
+        candidates=_candidates(args, robot),
     )
 
 
@@ -309,9 +310,11 @@ def _measured(args: argparse.Namespace, robot: Robot) -> Any:
     return read_measurements(args.measured, robot, degrees=args.degrees).data
 
 
-def _candidates(args: argparse.Namespace, robot: Robot) -> Any:
-    path = getattr(args, "candidates", None)
-    return None if path is None else read_configurations(path, robot, degrees=args.degrees)
+def _candidates(args: argparse.Namespace, robot: Robot) -> Candidates | None:
+    if getattr(args, "candidates", None) is None:
+        return None
+    rows = read_configurations(args.candidates, robot, degrees=args.degrees)
+    return Candidates(rows, args.repeat_candidates)
 
 
 # ── A plan for people: what it promises first, then the configurations ──────────────────────────────────────
@@ -319,39 +322,42 @@ def _candidates(args: argparse.Namespace, robot: Robot) -> Any:
 
 def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
     """Print a plan of ``robot``."""
-    console.print(f"{plan.status}: {plan.message}", style="green" if plan.status == "ok" else "yellow")
+    quality = plan.quality
+    console.print(f"{quality.status}: {quality.message}", style="green" if quality.status == "ok" else "yellow")
     if len(plan.test_poses):
         console.print(
-            f"Predicted accuracy ρ0 {length(plan.predicted_accuracy)} at the test pose"
+            f"Predicted accuracy ρ0 {length(quality.predicted_accuracy)} at the test pose"
             f"{'s (rms)' if len(plan.test_poses) > 1 else ''}, from {plan.measurements} measurements "
             f"with σ = {length(plan.sigma)}."
         )
     console.print(_bound(plan))
     console.print(_configurations(plan, robot))
     if len(plan.test_poses) > 1:
-        per = ", ".join(length(v) for v in plan.predicted_accuracy_per_test_pose)
+        per = ", ".join(length(v) for v in quality.predicted_accuracy_per_test_pose)
         console.print(f"ρ0 per test pose: {per}")
-    unseen = [n for n, s in zip(plan.parameters, plan.parameter_std, strict=True) if np.isinf(s)]
+    unseen = [n for n, s in zip(plan.parameters, quality.parameter_std, strict=True) if np.isinf(s)]
     if unseen:
         console.print(f"Not seen by this plan: {', '.join(unseen)}", style="yellow")
-    for combination in plan.unidentifiable:
+    for combination in quality.unidentifiable:
         console.print(f"No plan can tell apart: {combination}", soft_wrap=True)
     console.print(
-        f"{plan.starts} starts, {plan.evaluations} plans evaluated, {plan.seconds:.1f} s, seed {plan.seed}"
+        f"{quality.starts} starts, {quality.evaluations} plans evaluated, {quality.seconds:.1f} s, "
+        f"seed {quality.seed}"
     )
 
 
 def _bound(plan: Plan) -> str:
-    everywhere = f"Over all joint limits {length(plan.general_accuracy)} (rms)."
-    metric = plan.criterion in POSE_CRITERIA
-    value = length(plan.value) if metric else f"{plan.value:.5g}"
-    told = "" if plan.criterion == "test_pose" else f"Criterion {plan.criterion}: {value}. "
-    if plan.bound == "none":
+    quality = plan.quality
+    everywhere = f"Over all joint limits {length(quality.general_accuracy)} (rms)."
+    metric = quality.criterion in POSE_CRITERIA
+    value = length(quality.value) if metric else f"{quality.value:.5g}"
+    told = "" if quality.criterion == "test_pose" else f"Criterion {quality.criterion}: {value}. "
+    if quality.bound == "none":
         return f"{told}This criterion has no bound. {everywhere}"
-    limit = length(plan.value_bound) if metric else f"{plan.value_bound:.5g}"
+    limit = length(quality.value_bound) if metric else f"{quality.value_bound:.5g}"
     return (
         f"{told}No plan of {plan.measurements} measurements is better than {limit} "
-        f"({plan.bound} bound): efficiency {100 * plan.efficiency:.1f} %. {everywhere}"
+        f"({quality.bound} bound): efficiency {100 * quality.efficiency:.1f} %. {everywhere}"
     )
 
 
@@ -363,7 +369,7 @@ def show_tried(split: Split, console: Console) -> None:
     for p in split.tried:
         k, r = len(p.configurations), int(p.repetitions[0])
         table.add_row(
-            str(k), f"{r}×", str(p.measurements), length(p.value), style="bold" if p is split.plan else ""
+            str(k), f"{r}×", str(p.measurements), length(p.quality.value), style="bold" if p is split.plan else ""
         )
     console.print(table)
     if split.fewest:

@@ -9,10 +9,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from calib_planner.arrays import plain
 from calib_planner.cli.arguments import Commands, add_command, add_seed
 from calib_planner.cli.terminal import Terminal
 from calib_planner.io import shipped_robots
-from calib_planner.planning import plain
 from calib_planner.robot import Robot
 
 EXAMPLE = "calib-planner robots show kuka_kr270"

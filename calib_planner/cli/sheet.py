@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray, check_number
+from calib_planner.arrays import FloatArray, check_number, plain
 from calib_planner.cli.arguments import Commands, add_command, add_robot, load_robot, numbers
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import FileFormatError, InputError
@@ -27,7 +27,7 @@ from calib_planner.io import (
     write_sheet_yaml,
     write_trajectory,
 )
-from calib_planner.planning import DWELL, Pace, PlanSheet, plain, plan_sheet, usual_pace
+from calib_planner.planning import DWELL, Pace, PlanSheet, plan_sheet, usual_pace
 from calib_planner.report import write_sheet_page
 from calib_planner.robot import Robot
 from calib_planner.units import duration, length, signed
@@ -181,14 +181,14 @@ def show_sheet(sheet: PlanSheet, console: Console) -> None:
 
 
 def _promise(sheet: PlanSheet) -> str:
-    plan = sheet.plan
-    accuracy = (
-        f"Expected accuracy ρ0 {length(plan.predicted_accuracy)}" if len(plan.test_poses) else plan.criterion
-    )
-    if not np.isfinite(plan.efficiency):
+    quality = sheet.plan.quality
+    accuracy = quality.criterion
+    if len(sheet.plan.test_poses):
+        accuracy = f"Expected accuracy ρ0 {length(quality.predicted_accuracy)}"
+    if not np.isfinite(quality.efficiency):
         return f"{accuracy}."
-    bound = f", lower bound {length(plan.lower_bound)}" if np.isfinite(plan.lower_bound) else ""
-    return f"{accuracy}{bound} ({plan.bound}), efficiency {100 * plan.efficiency:.1f} %."
+    bound = f", lower bound {length(quality.lower_bound)}" if np.isfinite(quality.lower_bound) else ""
+    return f"{accuracy}{bound} ({quality.bound}), efficiency {100 * quality.efficiency:.1f} %."
 
 
 def _stops(sheet: PlanSheet) -> Table:

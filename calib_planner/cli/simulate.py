@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray, IntArray, check_count, check_number
+from calib_planner.arrays import FloatArray, IntArray, check_count, check_number, plain
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
@@ -23,7 +23,6 @@ from calib_planner.cli.terminal import Terminal
 from calib_planner.demo import independent_seeds
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io import measurements_text, read_plan, read_plan_csv, write_measurements
-from calib_planner.planning import plain
 from calib_planner.robot import Robot
 from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
 

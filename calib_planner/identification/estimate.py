@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtrc
 
-from calib_planner.arrays import FloatArray, check_configurations, frozen
+from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
 from calib_planner.identification.checks import HARMFUL, SIGNIFICANT, Disturbance, HiddenErrors, Structure
 from calib_planner.identification.noise_levels import FEWEST_SPARE, NoiseLevels
 from calib_planner.identification.transmission import Transmission
-from calib_planner.planning import plain
 from calib_planner.robot import Robot
 from calib_planner.units import counted, length, listed, milliradians
 

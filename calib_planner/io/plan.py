@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from calib_planner.errors import FileFormatError
 from calib_planner.io.yaml import check_keys, read_document, read_value, write_document
-from calib_planner.planning import Plan
+from calib_planner.planning import KEYS, KINDS, Plan
 
 SHAPES: dict[str, tuple[str, ...]] = {
     "configurations": ("configurations", "joint_names"),
@@ -32,7 +31,7 @@ def write_plan(path: str | Path, plan: Plan, field: str = "output") -> None:
     Raises:
         InputError: The path cannot be written; names ``field``.
     """
-    write_document(path, "plan", {f.name: getattr(plan, f.name) for f in fields(plan)}, field)
+    write_document(path, "plan", plan.values(), field)
 
 
 def read_plan(path: str | Path) -> Plan:
@@ -50,10 +49,8 @@ def parse_plan(path: str | Path, document: Any, finite: Sequence[str] = FINITE) 
     Raises:
         FileFormatError: As ``read_plan``; ``path`` is for the error.
     """
-    names = [f.name for f in fields(Plan)]
-    document = check_keys(path, "document", document, names)
-    kinds = {f.name: str(f.type) for f in fields(Plan)}
-    values = {n: read_value(path, n, kinds[n], document[n]) for n in names}
+    document = check_keys(path, "document", document, KEYS)
+    values = {n: read_value(path, n, KINDS[n], document[n]) for n in KEYS}
     for name, axes in SHAPES.items():
         wanted = tuple(len(values[a]) for a in axes)
         if values[name].shape != wanted:
@@ -64,4 +61,4 @@ def parse_plan(path: str | Path, document: Any, finite: Sequence[str] = FINITE) 
             raise FileFormatError(path, name, "a number that is not finite", "finite numbers only")
     if not (values["repetitions"] >= 1).all():
         raise FileFormatError(path, "repetitions", "a number below 1", "whole numbers >= 1")
-    return Plan(**values)
+    return Plan.from_values(values)

@@ -21,7 +21,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -500,8 +500,7 @@ def plan_text(plan: Plan | None) -> str | None:
     """A plan as JSON of its fields, exact to the bit; ``None`` for none."""
     if plan is None:
         return None
-    values = {f.name: getattr(plan, f.name) for f in fields(plan)}
-    return json.dumps({k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()})
+    return json.dumps({k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in plan.values().items()})
 
 
 def plan_of(path: str | Path, text: str | None) -> Plan | None:

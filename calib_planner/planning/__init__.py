@@ -1,7 +1,6 @@
 """Where to measure: a plan problem, the verb ``plan``, the plan, and how good it provably is."""
 
 from calib_planner.planning.budget import Split, plan_for_accuracy, split_budget
-from calib_planner.planning.compare import Comparison, compare, random_accuracies
 from calib_planner.planning.constraints import (
     JointRange,
     LineOfSight,
@@ -22,8 +21,9 @@ from calib_planner.planning.information import (
     plan_space,
     smallest_size,
 )
-from calib_planner.planning.plan import Plan, plain
 from calib_planner.planning.planner import Progress, plan
-from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.planning.problem import POSE_CRITERIA, Candidates, PlanPrior, PlanProblem, Search
+from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
+from calib_planner.planning.result import KEYS, KINDS, Plan, PlanQuality
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
 from calib_planner.planning.tour import DWELL, Pace, timetable, usual_pace, visiting_order

@@ -16,9 +16,9 @@ import numpy as np
 from calib_planner.arrays import check_count, check_number
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning.information import plan_space, smallest_size
-from calib_planner.planning.plan import Plan
 from calib_planner.planning.planner import plan, worth_of
 from calib_planner.planning.problem import PlanProblem
+from calib_planner.planning.result import Plan
 
 MOST_MEASUREMENTS = 10_000
 TRIED = 6
@@ -67,8 +67,8 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
         if found is None:
             continue
         tried.append(found)
-        if not fewest and problem.configuration_sigma == 0 and not problem.prior_std and not problem.measured:
-            fewest = int(np.ceil(found.measurements * (found.value_bound / accuracy) ** 2 * (1 - 1e-9)))
+        if not fewest and problem.repeatability == 0 and problem.prior.empty:
+            fewest = int(np.ceil(found.measurements * (found.quality.value_bound / accuracy) ** 2 * (1 - 1e-9)))
         if best is None or found.measurements < best.measurements:
             best = found
         if best.measurements <= max(fewest, k):
@@ -77,7 +77,7 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
         raise InfeasibleError(
             "accuracy",
             f"{accuracy:g} m is not reached by {smallest} to {MOST_CONFIGURATIONS} configurations, each repeated "
-            f"up to {MOST_MEASUREMENTS} measurements in all; ask for less, or lower sigma or configuration_sigma",
+            f"up to {MOST_MEASUREMENTS} measurements in all; ask for less, or lower noise or repeatability",
         )
     return Split(best, tuple(tried), fewest)
 
@@ -94,7 +94,7 @@ def _sizes(smallest: int) -> Iterator[int]:
 def _smallest_repetition(problem: PlanProblem, k: int, accuracy: float) -> Plan | None:
     """The plan of k configurations with the fewest repetitions that reaches ``accuracy``."""
     once = plan(replace(problem, configurations=k, repetitions=1))
-    if once.value <= accuracy:
+    if once.quality.value <= accuracy:
         return once
 
     def value(r: int) -> float:
@@ -108,7 +108,7 @@ def _smallest_repetition(problem: PlanProblem, k: int, accuracy: float) -> Plan 
         low, high = (low, middle) if value(middle) <= accuracy else (middle, high)
     # Configurations chosen for that many repetitions may do with fewer, where σ_c or a prior matters.
     found = plan(replace(problem, configurations=k, repetitions=high))
-    return found if found.value <= accuracy else None
+    return found if found.quality.value <= accuracy else None
 
 
 def split_budget(
@@ -133,8 +133,8 @@ def split_budget(
     for k in sizes:
         tried.append(plan(replace(problem, configurations=k, repetitions=measurements // k)))
         watch(len(tried), len(sizes))
-    best = min(p.value for p in tried)
-    chosen = next(p for p in tried if p.value <= best * (1.0 + tolerance))
+    best = min(p.quality.value for p in tried)
+    chosen = next(p for p in tried if p.quality.value <= best * (1.0 + tolerance))
     return Split(chosen, tuple(tried), 0)
 
 

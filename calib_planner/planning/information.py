@@ -47,13 +47,13 @@ class InformationModel:
     Attributes:
         robot: Its active parameters are the order of all matrices.
         noise: Covariance of one measured point.
-        configuration_sigma: σ_c [m].
+        repeatability: σ_c [m].
         repetitions: r, measurements at each configuration.
     """
 
     robot: Robot
     noise: Noise
-    configuration_sigma: float = 0.0
+    repeatability: float = 0.0
     repetitions: int = 1
 
     def at(self, q: FloatArray) -> FloatArray:
@@ -67,7 +67,7 @@ class InformationModel:
         points, jacobian = self.robot.positions_and_jacobian(q)
         jacobian = np.ascontiguousarray(jacobian)
         if isinstance(self.noise, Isotropic):
-            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2)
+            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.repeatability**2)
         whitener = np.linalg.inv(np.linalg.cholesky(self._covariance(points)))
         return (whitener @ jacobian.reshape(*points.shape, -1)).reshape(jacobian.shape)
 
@@ -81,13 +81,13 @@ class InformationModel:
     def _weigh(self, points: FloatArray, jacobian: FloatArray) -> FloatArray:
         """W J, (N, 3·targets, p)."""
         if isinstance(self.noise, Isotropic):
-            variance = self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2
+            variance = self.noise.sigma**2 / self.repetitions + self.repeatability**2
             return jacobian / variance
         blocks = jacobian.reshape(*points.shape, -1)
         return (np.linalg.inv(self._covariance(points)) @ blocks).reshape(jacobian.shape)
 
     def _covariance(self, points: FloatArray) -> FloatArray:
-        common = self.configuration_sigma**2 * np.eye(3)
+        common = self.repeatability**2 * np.eye(3)
         return self.noise.covariance(points) / self.repetitions + common
 
 
@@ -211,7 +211,7 @@ class PlanSpace:
 
     def search_criterion(self) -> Criterion:
         """What the search maximises: the criterion asked for, kept from going blind elsewhere."""
-        share = self.problem.general_weight
+        share = self.problem.search.general_weight
         plain = self.criterion(self.problem.criterion)
         inner = plain.inner if isinstance(plain, Eliminating) else plain
         if self.problem.criterion != "test_pose" or not isinstance(inner, Accuracy) or share == 0:
@@ -254,13 +254,13 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(kept)))
     if len(problem.test_pose_array):
         tests = robot.jacobian(problem.test_pose_array) * mask
-    single = InformationModel(robot, problem.instrument, problem.configuration_sigma)
+    single = InformationModel(robot, problem.instrument, problem.repeatability)
     return PlanSpace(
         problem=problem,
         robot=robot,
         identifiability=found,
         interest=interest,
-        model=InformationModel(robot, problem.instrument, problem.configuration_sigma, problem.repetitions),
+        model=InformationModel(robot, problem.instrument, problem.repeatability, problem.repetitions),
         single=single,
         prior=prior[np.ix_(kept, kept)],
         feasibility=feasibility,
@@ -275,8 +275,8 @@ def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArra
     rng = np.random.default_rng(0)
     if problem.candidates is None:
         return feasibility.sample(rng, SAMPLE)
-    pool = np.asarray(problem.candidates)
-    feasibility.check_pool(pool, 1 if problem.repeat_candidates else problem.configurations)
+    pool = np.asarray(problem.candidate_array)
+    feasibility.check_pool(pool, problem.configurations if problem.once_each else 1)
     return pool if len(pool) <= SAMPLE else pool[rng.choice(len(pool), SAMPLE, replace=False)]
 
 
@@ -284,12 +284,12 @@ def _prior_rows(problem: PlanProblem) -> FloatArray:
     """(rows, P) whitened equations known beforehand: M_0 = rowsᵀ rows."""
     names = problem.robot.parameter_names
     rows: list[FloatArray] = [np.zeros((0, len(names)))]
-    for name, std in problem.prior_std.items():
+    for name, std in problem.prior.std.items():
         rows.append((np.arange(len(names)) == names.index(name))[None] / std)
-    if problem.measured is not None:
-        data = problem.measured
+    if problem.prior.measured is not None:
+        data = problem.prior.measured
         points, jacobian = problem.robot.positions_and_jacobian(data.q)
-        noise = problem.instrument.covariance(points) + problem.configuration_sigma**2 * np.eye(3)
+        noise = problem.instrument.covariance(points) + problem.repeatability**2 * np.eye(3)
         whitener = np.linalg.inv(np.linalg.cholesky(noise))
         whitened = whitener @ jacobian.reshape(*points.shape, -1)
         rows.append(whitened[data.seen].reshape(-1, len(names)))

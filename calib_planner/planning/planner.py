@@ -24,8 +24,8 @@ from calib_planner.planning.criteria import (
     reported_value,
 )
 from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
-from calib_planner.planning.plan import STATUS, Plan
 from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.planning.result import STATUS, Plan, PlanQuality
 from calib_planner.planning.search.exchange import PoolProblem, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.planning.search.prediction import choose_for_prediction, prediction_problem
@@ -84,7 +84,7 @@ def plan(
     """
     space = plan_space(problem)
     clock = _Clock(problem, len(space.interest), callback)
-    *seeds, own = np.random.SeedSequence(problem.seed).spawn(len(parts(problem.starts)) + 1)
+    *seeds, own = np.random.SeedSequence(problem.search.seed).spawn(len(parts(problem.search.starts)) + 1)
     criterion, target = _criteria(space, np.random.default_rng(own))
     rng = np.random.default_rng(own)
     relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
@@ -115,11 +115,11 @@ class _Clock:
 
     def __init__(self, problem: PlanProblem, size: int, callback: Callback | None) -> None:
         self.began = time.perf_counter()
-        self.deadline = self.began + problem.time_limit
+        self.deadline = self.began + problem.search.time_limit
         self.callback = callback
         self.problem, self.size = problem, size
         self.cancelled = self.late = False
-        self.last = Progress(0, problem.starts, float("nan"), float("nan"), 0.0)
+        self.last = Progress(0, problem.search.starts, float("nan"), float("nan"), 0.0)
 
     def stop(self) -> bool:
         self.late = self.late or time.perf_counter() > self.deadline
@@ -174,13 +174,9 @@ def _relaxed_problem(space: PlanSpace, criterion: Criterion) -> RelaxedProblem:
         space.prior,
         problem.measurements,
         space.feasibility,
-        _pool(problem),
-        None if problem.candidates is None or problem.repeat_candidates else problem.configurations,
+        problem.candidate_array,
+        problem.configurations if problem.once_each else None,
     )
-
-
-def _pool(problem: PlanProblem) -> FloatArray | None:
-    return None if problem.candidates is None else np.asarray(problem.candidates)
 
 
 def _search(
@@ -202,7 +198,7 @@ def _search(
         support=relaxed.support if relaxed else nobody,
         weights=relaxed.weights if relaxed else np.empty(0),
     )
-    sizes = parts(space.problem.starts)
+    sizes = parts(space.problem.search.starts)
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
     best: SearchResult | None = None
     done = evaluations = 0
@@ -246,7 +242,7 @@ def _choose(
 ) -> SearchResult:
     """From the candidates."""
     problem = space.problem
-    pool = np.asarray(problem.candidates)
+    pool = np.asarray(problem.candidate_array)
     allowed = np.flatnonzero(space.feasibility.mask(pool))
     if problem.discrepancy is not None:
         chosen = choose_for_prediction(prediction_problem(problem, pool[allowed]), clock.stop)
@@ -256,12 +252,12 @@ def _choose(
         criterion=criterion,
         prior=space.prior,
         size=problem.configurations,
-        repeat=problem.repeat_candidates,
+        repeat=not problem.once_each,
         weights=relaxed.weights if relaxed else np.empty(0),
         names=space.robot.parameter_names,
     )
     chosen = choose(request, rng, clock.stop)
-    clock.tell(problem.starts, chosen.log_worth)
+    clock.tell(problem.search.starts, chosen.log_worth)
     return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
 
 
@@ -305,19 +301,11 @@ def _assemble(
             " Chosen for a robot with systematic errors; value, bound and efficiency are for white noise alone."
         )
     note += f" {proof.text}" if proof else ""
-    return Plan(
-        robot=robot.name,
-        criterion=name,
-        parameters=problem.robot.parameter_names,
-        joint_names=robot.joint_names,
-        configurations=configurations,
-        repetitions=np.full(len(configurations), problem.repetitions),
-        test_poses=problem.test_pose_array,
-        weights=shares,
-        sigma=problem.instrument.typical,
-        predicted_accuracy=accuracy,
+    quality = PlanQuality(
         predicted_accuracy_per_test_pose=per,
         parameter_std=_parameter_deviations(space, inverse, hidden),
+        criterion=name,
+        predicted_accuracy=accuracy,
         unidentifiable=combinations,
         general_accuracy=float(np.sqrt(general)),
         value=value,
@@ -328,9 +316,20 @@ def _assemble(
         status=status,
         message=STATUS[status] + note,
         seconds=clock.seconds,
-        seed=problem.seed,
+        seed=problem.search.seed,
         starts=found.starts,
         evaluations=found.evaluations,
+    )
+    return Plan(
+        robot=robot.name,
+        parameters=problem.robot.parameter_names,
+        joint_names=robot.joint_names,
+        configurations=configurations,
+        repetitions=np.full(len(configurations), problem.repetitions),
+        test_poses=problem.test_pose_array,
+        weights=shares,
+        sigma=problem.instrument.typical,
+        quality=quality,
     )
 
 

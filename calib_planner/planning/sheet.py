@@ -25,7 +25,7 @@ from calib_planner.planning.constraints import (
 )
 from calib_planner.planning.constraints.self_collision import SelfCollision
 from calib_planner.planning.feasibility import Constraint
-from calib_planner.planning.plan import Plan
+from calib_planner.planning.result import Plan
 from calib_planner.planning.tour import Pace, Timetable, timetable, usual_pace
 from calib_planner.robot import Robot
 from calib_planner.tracker import LaserTracker, Noise, distances, elevations, incidence_cosines
@@ -82,6 +82,7 @@ class PlanSheet:
     def to_dict(self) -> dict[str, Any]:
         """Head, joints, checks, time and stops as plain values, SI units; ``None`` stands for not checked."""
         plan, checks, times = self.plan, self.checks, self.timetable
+        promised = plan.values()
         joints = zip(
             plan.joint_names,
             self.robot.joint_is_revolute,
@@ -93,7 +94,7 @@ class PlanSheet:
             "id": self.identity,
             "robot": self.robot.name,
             "planned_for": plan.robot,
-            **{name: getattr(plan, name) for name in HEAD},
+            **{name: promised[name] for name in HEAD},
             "configurations": len(plan.configurations),
             "measurements": plan.measurements,
             "joints": [

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, IntArray, check_array, check_number, frozen
 from calib_planner.errors import InputError
-from calib_planner.planning.plan import Plan
+from calib_planner.planning.result import Plan
 from calib_planner.robot import Robot
 
 LARGE = 200

@@ -1,5 +1,9 @@
-"""Pages and charts for people: the calibration report, the plan sheet and where a result comes from."""
+"""Pages for people: the calibration report, the plan sheet, and where a result comes from.
+
+``render`` is the one template engine, also for other packages. docs/glossary.md explains the words.
+"""
 
 from calib_planner.report.page import write_report
 from calib_planner.report.plan_sheet import write_sheet_page
 from calib_planner.report.provenance import InputFile, Provenance, provenance
+from calib_planner.report.render import render

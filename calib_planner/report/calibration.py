@@ -1,8 +1,8 @@
-"""The report of a calibration: is it good, how good, what says so, what to do with it, where it comes from.
+"""The report of a calibration: is it good, how good, which numbers say so, how to apply it, where it comes from.
 
-``calibration_report`` gathers what was asked and what was found; ``write_report`` makes one HTML file of it that
-needs nothing else. All of it is in the page once more as JSON, ``<script id="report-data">``: ``estimate`` is
-``Estimate.to_dict()`` unchanged, and every number shown names the key that it was taken from.
+``calibration_report`` gathers a problem, its estimate and what is drawn of them; ``write_report`` makes one HTML
+file of it that needs nothing else. The page also holds all of it as JSON, ``<script id="report-data">``, where
+``estimate`` is ``Estimate.to_dict()`` unchanged.
 """
 
 from __future__ import annotations
@@ -12,25 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import Estimate, IdentificationProblem, fit_placement, start_robot
 from calib_planner.measurements import Measurements
-from calib_planner.planning import plain
 from calib_planner.report.provenance import Provenance
 from calib_planner.report.scene import Scene, scene_of
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """A question, its answer, and what is drawn of them.
+    """An identification problem, its estimate, and what is drawn of them.
 
     Attributes:
-        problem: What was asked.
-        estimate: What was found, with its validation if there was one.
+        problem: The problem that was solved.
+        estimate: Its estimate, with the validation if there was one.
         provenance: Where it comes from.
         before: (N, targets, 3) measured − predicted with the nominal kinematics, base and targets fitted where
-            they are unknown [m], NaN where not measured.
+            they are unknown, in the frame of the measurements [m]; NaN where not measured.
         scene: The 3-D view.
     """
 
@@ -42,7 +41,7 @@ class CalibrationReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What the page holds as JSON; non-finite numbers are ``None``."""
-        known: dict[str, Any] = plain(
+        values: dict[str, Any] = plain(
             {
                 "estimate": self.estimate.to_dict(),
                 "required_accuracy": self.estimate.required_accuracy,
@@ -53,7 +52,7 @@ class CalibrationReport:
                 "provenance": self.provenance.to_dict(),
             }
         )
-        return known
+        return values
 
 
 def calibration_report(
@@ -62,31 +61,25 @@ def calibration_report(
     """Gather the report.
 
     Args:
-        problem: What was asked.
+        problem: The problem that was solved.
         estimate: ``identify(problem)``, possibly with ``validate`` and ``cross_validate``.
         provenance: See ``provenance.provenance``; default: versions and date alone.
 
     Raises:
         InputError: The estimate is of other data or another robot.
     """
-    same = estimate.parameters == problem.robot.parameter_names and estimate.robot == problem.robot.name
-    if not same or estimate.residuals.shape != problem.data.p.shape:
+    robot, data = problem.robot, problem.data
+    same = estimate.parameters == robot.parameter_names and estimate.robot == robot.name
+    if not same or estimate.residuals.shape != data.p.shape:
         size = "{} rows and {} parameters of {}"
         got = size.format(len(estimate.residuals), len(estimate.parameters), estimate.robot)
-        asked = size.format(len(problem.data), len(problem.robot.parameter_names), problem.robot.name)
-        raise InputError("estimate", got, asked, "give the problem that the estimate answers")
-    before = _before(problem, estimate)
-    return CalibrationReport(
-        problem, estimate, provenance or Provenance(), before, scene_of(problem, estimate, before)
-    )
-
-
-def _before(problem: IdentificationProblem, estimate: Estimate) -> FloatArray:
-    """As ``Estimate.residual_before``, for every point."""
-    data = problem.data
+        valid = size.format(len(data), len(robot.parameter_names), robot.name)
+        raise InputError("estimate", got, valid, "give the problem that the estimate answers")
     points = np.array(data.p)
     for rejected in estimate.rejected:
         points[rejected["row"], rejected["target"] - 1] = np.nan
     used = Measurements(data.joint_names, data.q, points, data.std)
-    start = start_robot(problem.robot, data, robust=problem.loss == "robust")
-    return np.asarray(data.p - fit_placement(start, used).positions(data.q))
+    nominal = fit_placement(start_robot(robot, data, robust=problem.loss == "robust"), used)
+    before = np.asarray(data.p - nominal.positions(data.q))
+    scene = scene_of(problem, estimate, before)
+    return CalibrationReport(problem, estimate, provenance or Provenance(), before, scene)

@@ -13,9 +13,10 @@ from typing import Any
 
 from calib_planner import __version__
 from calib_planner.errors import FileFormatError
+from calib_planner.io import config_folder, shipped_robots
 
 LIBRARIES = ("numpy", "scipy")
-CHUNK = 1 << 20
+"""Libraries whose versions can change a result."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Provenance:
     seed: int | None = None
     estimate: str = ""
     written: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(timespec="seconds"))
-    versions: Mapping[str, str] = field(default_factory=lambda: program_versions())
+    versions: Mapping[str, str] = field(default_factory=lambda: _versions())
 
     def named(self, role: str) -> str:
         """Name of the first input of that role; empty without one."""
@@ -71,24 +72,17 @@ def provenance(
 ) -> Provenance:
     """Provenance with the hashes of ``files``, pairs (role, path); the other arguments as in ``Provenance``.
 
-    The name of a robot that comes with the package is a path, too: of its YAML.
+    The name of a robot that comes with the package stands for the path of its YAML.
 
     Raises:
         FileFormatError: A file cannot be read.
     """
-    inputs = tuple(InputFile(role, _text(path), sha256_of(_resolved(role, path))) for role, path in files)
-    return Provenance(inputs, _text(command), seed, _text(estimate))
-
-
-def program_versions() -> dict[str, str]:
-    """This package, Python, and the libraries that compute."""
-    found = {"calib_planner": __version__, "Python": platform.python_version()}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+    inputs = []
+    for role, name in files:
+        shipped = role == "robot" and str(name) in shipped_robots()
+        path = config_folder() / "robots" / f"{name}.yaml" if shipped else name
+        inputs.append(InputFile(role, _text(name), sha256_of(path)))
+    return Provenance(tuple(inputs), _text(command), seed, _text(estimate))
 
 
 def sha256_of(path: str | Path) -> str:
@@ -99,31 +93,34 @@ def sha256_of(path: str | Path) -> str:
     """
     path = Path(path).expanduser()
     try:
-        if path.is_dir():
-            files = sorted(p for p in path.rglob("*") if p.is_file())
-            lines = "".join(f"{_digest(p)} {p.relative_to(path).as_posix()}\n" for p in files)
-            return hashlib.sha256(lines.encode()).hexdigest()
-        return _digest(path)
+        if not path.is_dir():
+            return _digest(path)
+        files = sorted(p for p in path.rglob("*") if p.is_file())
+        lines = "".join(f"{_digest(p)} {p.relative_to(path).as_posix()}\n" for p in files)
+        return hashlib.sha256(lines.encode()).hexdigest()
     except OSError as error:
         raise FileFormatError(path, "file", error.strerror or error, "a file that can be read") from None
 
 
 def _digest(path: Path) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while block := file.read(CHUNK):
-            found.update(block)
-    return found.hexdigest()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _versions() -> dict[str, str]:
+    """This package, Python, and the libraries that compute."""
+    versions = {"calib_planner": __version__, "Python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "unknown"
+    return versions
 
 
 def _text(path: str | Path) -> str:
     """A path as text that can be written: names of files need not be UTF-8."""
     return str(path).encode("utf-8", "replace").decode()
-
-
-def _resolved(role: str, path: str | Path) -> Path:
-    from calib_planner.io import config_folder, shipped_robots
-
-    if role == "robot" and str(path) in shipped_robots():
-        return config_folder() / "robots" / f"{path}.yaml"
-    return Path(path)

@@ -10,19 +10,25 @@ rejected, and an even choice of the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.arrays import FloatArray, IntArray, plain
 from calib_planner.identification import Estimate, IdentificationProblem
+from calib_planner.report.render import Drawing, Shape, shape
 from calib_planner.robot import Robot
 
 MOST_ROBOTS = 300
 """Configurations whose robot can be shown."""
 USED, SUSPECT, REJECTED = range(3)
 """States of a point."""
+
+WIDTH, HEIGHT, RIM = 640.0, 420.0, 24.0
+YAW, PITCH = np.radians(-50.0), np.radians(22.0)
+MOST_POINTS = 800
+"""Of the still picture: its size, from where it looks, and how many points it shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,23 +66,12 @@ class Scene:
     tracker: FloatArray | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Lists, rounded to what can be seen: positions to 10 µm, errors to 10 nm, angles to 10 µrad."""
-        return {
-            "joint_names": list(self.joint_names),
-            "revolute": list(self.revolute),
-            "q": self.q.round(5).tolist(),
-            "rows": self.rows.tolist(),
-            "targets": self.targets.tolist(),
-            "points": self.points.round(5).tolist(),
-            "after": self.after.round(8).tolist(),
-            "before": self.before.round(8).tolist(),
-            "states": self.states.tolist(),
-            "robot_rows": self.robot_rows.tolist(),
-            "robots": self.robots.round(4).tolist(),
-            "test_robots": self.test_robots.round(4).tolist(),
-            "target_count": self.target_count,
-            "tracker": None if self.tracker is None else self.tracker.round(4).tolist(),
-        }
+        """Plain values, rounded to what can be seen: positions to 10 µm, errors to 10 nm, angles to 10 µrad."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        digits = {"q": 5, "points": 5, "after": 8, "before": 8, "robots": 4, "test_robots": 4}
+        digits |= {"tracker": 4} if self.tracker is not None else {}
+        rounded: dict[str, Any] = plain(values | {name: values[name].round(n) for name, n in digits.items()})
+        return rounded
 
 
 def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatArray) -> Scene:
@@ -87,7 +82,9 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
     seen = tuple(where.T)
     states = point_states(estimate)[seen]
     size = np.linalg.norm(estimate.residuals[seen], axis=1)
-    rows = _robot_rows(len(data), where[:, 0], np.where(states == USED, size, np.inf))
+    worst = np.full(len(data), -1.0)
+    np.maximum.at(worst, where[:, 0], np.where(states == USED, size, np.inf))
+    rows = thinned(worst, MOST_ROBOTS)
     return Scene(
         joint_names=robot.joint_names,
         revolute=tuple(bool(r) for r in robot.joint_is_revolute),
@@ -99,8 +96,8 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
         before=before[seen] @ turn,
         states=states,
         robot_rows=rows,
-        robots=_bodies(robot, data.q[rows]),
-        test_robots=_bodies(robot, estimate.test_poses.reshape(-1, len(robot.joint_names))),
+        robots=bodies(robot, data.q[rows]),
+        test_robots=bodies(robot, estimate.test_poses.reshape(-1, len(robot.joint_names))),
         target_count=len(robot.targets),
         tracker=_tracker(problem, turn, place),
     )
@@ -126,14 +123,12 @@ def thinned(importance: FloatArray, most: int) -> IntArray:
     return np.unique(np.concatenate([first, even]))
 
 
-def _robot_rows(count: int, rows: IntArray, importance: FloatArray) -> IntArray:
-    worst = np.full(count, -1.0)
-    np.maximum.at(worst, rows, importance)
-    return thinned(worst, MOST_ROBOTS)
+def bodies(robot: Robot, q: FloatArray) -> FloatArray:
+    """(N, B, 3) base, a point on each joint's axis, tip, then the targets, in the frame of the base [m].
 
-
-def _bodies(robot: Robot, q: FloatArray) -> FloatArray:
-    """(N, B, 3) in the base's frame."""
+    Args:
+        q: (N, joints) configurations [rad | m].
+    """
     turn, place = robot.base_pose
     if not len(q):
         return np.empty((0, len(robot.joint_names) + 2 + len(robot.targets), 3))
@@ -147,48 +142,41 @@ def _tracker(problem: IdentificationProblem, turn: FloatArray, place: FloatArray
     """From the instrument if it knows its station, else the origin of a frame that is not the base's own."""
     station = getattr(problem.instrument, "station", None)
     own = np.allclose(turn, np.eye(3), atol=1e-9) and np.allclose(place, 0.0, atol=1e-9)
-    asked = any(n.startswith("base.") for n in problem.robot.parameter_names)
-    if station is None and own and not asked:
+    if station is None and own and not any(n.startswith("base.") for n in problem.robot.parameter_names):
         return None
     return np.asarray((np.zeros(3) if station is None else np.asarray(station)) - place) @ turn
 
 
-# ── The scene from one side, as SVG: for readers without JavaScript, such as mail programs on phones ────────
-
-WIDTH, HEIGHT, RIM = 640.0, 420.0, 24.0
-YAW, PITCH = np.radians(-50.0), np.radians(22.0)
-MOST = 800
-"""Points drawn."""
+# ── The scene from one side: for readers without JavaScript, such as mail programs on phones ─────────────────
 
 
-def still_picture(scene: Scene) -> str:
-    """An ``<svg>``: the floor, every point, the first robot, the test poses and the tracker."""
-    keep = thinned(np.linalg.norm(scene.after, axis=1), MOST)
-    bodies = np.concatenate([scene.robots[:1], scene.test_robots])
+def still_picture(scene: Scene) -> Drawing:
+    """The floor, points, the first robot, the test poses and the tracker, in parallel projection."""
+    chosen = thinned(np.linalg.norm(scene.after, axis=1), MOST_POINTS)
+    robots = np.concatenate([scene.robots[:1], scene.test_robots])
     tracker = np.empty((0, 3)) if scene.tracker is None else scene.tracker[None]
     inside = scene.points[scene.states != REJECTED]
-    fit = _Fit(np.concatenate([bodies.reshape(-1, 3), inside, tracker]))
-    parts = [f'<polyline class="floor" points="{fit.text(_circle(scene))}"/>']
-    for i, body in enumerate(bodies):
+    fit = _Fit(np.concatenate([robots.reshape(-1, 3), inside, tracker]))
+    shapes = [shape("polyline", class_="floor", points=fit.text(_circle(scene)))]
+    for i, body in enumerate(robots):
         arm = body[: len(body) - scene.target_count]
-        parts += [f'<polyline class="{"arm" if i == 0 else "test"}" points="{fit.text(arm)}"/>']
-        parts += [f'<circle class="joint" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>' for x, y in fit(arm[1:])] * (
-            i == 0
-        )
-    for name, chosen in (("point", scene.states[keep] != REJECTED), ("gross", scene.states[keep] == REJECTED)):
-        marks = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in fit(scene.points[keep][chosen]))
-        parts.append(f'<path class="dots {name}" d="{marks}"/>')
-    for x, y in fit(tracker):
-        parts.append(f'<rect class="tracker" x="{x - 6:.1f}" y="{y - 6:.1f}" width="12" height="12"/>')
-        parts.append(f'<text x="{x:.1f}" y="{y - 10:.1f}" text-anchor="middle">tracker</text>')
-    return (
-        f'<svg class="still" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" '
-        f'aria-label="robot, measured points and test poses from one side">{"".join(parts)}</svg>'
-    )
+        shapes.append(shape("polyline", class_="test" if i else "arm", points=fit.text(arm)))
+        if not i:
+            shapes += [shape("circle", class_="joint", cx=x, cy=y, r="3.5") for x, y in fit.pairs(arm[1:])]
+    states = scene.states[chosen]
+    for name, those in (("point", states != REJECTED), ("gross", states == REJECTED)):
+        marks = "".join(f"M{x} {y}h0" for x, y in fit.pairs(scene.points[chosen][those]))
+        shapes.append(shape("path", class_=f"dots {name}", d=marks))
+    for x, y in fit(tracker).tolist():
+        corner = {"x": f"{x - 6:.1f}", "y": f"{y - 6:.1f}"}
+        shapes.append(Shape("rect", {"class": "tracker", **corner, "width": "12", "height": "12"}))
+        shapes.append(shape("text", "tracker", x=f"{x:.1f}", y=f"{y - 10:.1f}", text_anchor="middle"))
+    title = "robot, measured points and test poses from one side"
+    return Drawing("still", f"{WIDTH:g} {HEIGHT:g}", title, shapes)
 
 
 class _Fit:
-    """Orthographic view, scaled so that the given points fill the picture."""
+    """Parallel projection, scaled so that the given points fill the picture."""
 
     def __init__(self, points: FloatArray) -> None:
         flat = _turned(points)
@@ -197,12 +185,16 @@ class _Fit:
         self._scale = float((room / np.maximum(high - low, 1e-9)).min())
         self._middle = (low + high) / 2
 
-    def __call__(self, points: FloatArray) -> list[tuple[float, float]]:
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """(N, 3) in the base's frame [m] → (N, 2) in the picture [drawing units]."""
         flat = (_turned(points) - self._middle) * self._scale * [1, -1] + [WIDTH / 2, HEIGHT / 2]
-        return [(float(x), float(y)) for x, y in np.clip(flat, 0, [WIDTH, HEIGHT])]
+        return np.clip(flat, 0, [WIDTH, HEIGHT])
+
+    def pairs(self, points: FloatArray) -> list[tuple[str, str]]:
+        return [(f"{x:.1f}", f"{y:.1f}") for x, y in self(points).tolist()]
 
     def text(self, points: FloatArray) -> str:
-        return " ".join(f"{x:.1f} {y:.1f}" for x, y in self(points))
+        return " ".join(f"{x} {y}" for x, y in self.pairs(points))
 
 
 def _turned(points: FloatArray) -> FloatArray:

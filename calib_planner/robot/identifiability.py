@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from calib_planner.arrays import FloatArray
 
@@ -114,6 +113,8 @@ def _directions(
     ``triangle`` (kept, kept) and ``shares``, each (those kept before it,), are the columns kept and held in the
     orthonormal basis.
     """
+    from scipy.linalg import solve_triangular  # 0.1 s, which only who analyses parameters waits for
+
     directions = np.zeros((len(held), len(scale)))
     directions[np.arange(len(held)), held] = 1.0
     if kept and held:

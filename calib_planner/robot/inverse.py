@@ -25,7 +25,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.robot.chain import Robot
@@ -167,6 +166,8 @@ def _step(
 
 def _residual_and_jacobian(robot: Robot, goals: Goals, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(N, m) residual and (N, m, joints) J, with m = 3 or 6."""
+    from scipy.spatial.transform import Rotation  # 0.1 s, which only inverse kinematics waits for
+
     posture = robot.posture(q)
     xyz = posture.tip_origin + posture.tip_rotation @ goals.point
     turning = robot.joint_is_revolute[:, None]

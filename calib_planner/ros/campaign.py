@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from calib_planner_msgs.action import ExecutePlan
@@ -27,7 +27,7 @@ from calib_planner.campaign import (
 from calib_planner.errors import InputError
 from calib_planner.identification import Verdict
 from calib_planner.io import write_estimate, write_measurements
-from calib_planner.planning import Plan
+from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import estimate_to_message, plan_to_message
@@ -94,9 +94,8 @@ class Announced:
 
     def part(self, row: int) -> Plan:
         """One row, to be measured once."""
-        values = {name: getattr(self.plan, name) for name in self.plan.__dataclass_fields__}
-        values |= {"configurations": self.plan.configurations[row : row + 1], "repetitions": np.array([1])}
-        return Plan(**values)
+        q = self.plan.configurations[row : row + 1]
+        return replace(self.plan, configurations=q, repetitions=np.array([1]))
 
 
 def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
@@ -108,7 +107,6 @@ def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
     accuracy = float("nan") if last is None else last.accuracy
     plan = Plan(
         robot=problem.robot.name,
-        criterion="test_pose",
         parameters=problem.robot.parameter_names,
         joint_names=problem.robot.joint_names,
         configurations=np.array([state.stops[i].q for i in stops]),
@@ -116,22 +114,14 @@ def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
         test_poses=poses,
         weights=np.full(len(poses), 1.0 / len(poses)),
         sigma=problem.instrument.typical,
-        predicted_accuracy=accuracy,
-        predicted_accuracy_per_test_pose=np.full(len(poses), accuracy),
-        parameter_std=np.full(len(problem.robot.parameter_names), np.nan),
-        unidentifiable=(),
-        general_accuracy=float("nan"),
-        value=accuracy,
-        value_bound=float("nan"),
-        lower_bound=float("nan"),
-        efficiency=float("nan"),
-        bound="none",
-        status="ok",
-        message=state.message,
-        seconds=0.0,
-        seed=problem.seed,
-        starts=0,
-        evaluations=0,
+        quality=PlanQuality(
+            predicted_accuracy_per_test_pose=np.full(len(poses), accuracy),
+            parameter_std=np.full(len(problem.robot.parameter_names), np.nan),
+            predicted_accuracy=accuracy,
+            value=accuracy,
+            message=state.message,
+            seed=problem.seed,
+        ),
     )
     return Announced(f"{campaign_id}-{role}-{uuid.uuid4().hex[:8]}", plan, tuple(stops), role)
 

@@ -275,7 +275,7 @@ def run_demo(options: Options, screen: Screen) -> DemoResult:
     screen.say("comparing with random plans")
     robot = Robot.load(ROBOT).with_parameters(LEVEL)
     received = plan_from_message(plan).plan
-    problem = PlanProblem(robot, [TEST_POSE], options.configurations, sigma=received.sigma)
+    problem = PlanProblem(robot, [TEST_POSE], options.configurations, noise=received.sigma)
     truth = random_deviations(robot, options.seed)
     result = demo_report(problem, received, estimate, truth, seed=options.seed, report=options.folder)
     draw(result, options.folder / "demo.png")

@@ -22,7 +22,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from calib_planner.acquisition import NANO, Reason, Rejection, Standstill, pick_joints
 from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
-from calib_planner.planning import Pace, Plan, timetable
+from calib_planner.planning import Pace, Plan, PlanQuality, timetable
 from calib_planner.robot import Robot
 from calib_planner.units import brief
 
@@ -95,22 +95,22 @@ def plan_to_message(plan: Plan, plan_id: str, stamp: int, frame_id: str) -> Plan
     message = PlanMessage(
         plan_id=plan_id,
         robot=plan.robot,
-        criterion=plan.criterion,
+        criterion=plan.quality.criterion,
         parameters=list(plan.parameters),
         joint_names=list(plan.joint_names),
         configurations=plan.configurations.ravel().tolist(),
         repetitions=plan.repetitions.tolist(),
         test_poses=plan.test_poses.ravel().tolist(),
         sigma=float(plan.sigma),
-        predicted_accuracy=float(plan.predicted_accuracy),
-        predicted_accuracy_per_test_pose=plan.predicted_accuracy_per_test_pose.tolist(),
-        lower_bound=float(plan.lower_bound),
-        efficiency=float(plan.efficiency),
-        bound=plan.bound,
-        seed=int(plan.seed) % 2**32,
-        seconds=float(plan.seconds),
-        status=PLAN_STATUS[plan.status],
-        message=plan.message,
+        predicted_accuracy=float(plan.quality.predicted_accuracy),
+        predicted_accuracy_per_test_pose=plan.quality.predicted_accuracy_per_test_pose.tolist(),
+        lower_bound=float(plan.quality.lower_bound),
+        efficiency=float(plan.quality.efficiency),
+        bound=plan.quality.bound,
+        seed=int(plan.quality.seed) % 2**32,
+        seconds=float(plan.quality.seconds),
+        status=PLAN_STATUS[plan.quality.status],
+        message=plan.quality.message,
     )
     message.header.stamp = stamp_message(stamp)
     message.header.frame_id = frame_id
@@ -142,7 +142,6 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
         raise InputError("predicted_accuracy_per_test_pose", accuracy.shape, expected)
     plan = Plan(
         robot=message.robot,
-        criterion=message.criterion,
         parameters=tuple(message.parameters),
         joint_names=joints,
         configurations=q,
@@ -150,22 +149,21 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
         test_poses=poses,
         weights=np.full(len(poses), np.nan),
         sigma=check_number("sigma", message.sigma, low=0, high=1, unit="m"),
-        predicted_accuracy=float(message.predicted_accuracy),
-        predicted_accuracy_per_test_pose=accuracy,
-        parameter_std=np.full(len(message.parameters), np.nan),
-        unidentifiable=(),
-        general_accuracy=float("nan"),
-        value=float(message.predicted_accuracy),
-        value_bound=float(message.lower_bound),
-        lower_bound=float(message.lower_bound),
-        efficiency=float(message.efficiency),
-        bound=message.bound,
-        status=status,
-        message=message.message,
-        seconds=float(message.seconds),
-        seed=int(message.seed),
-        starts=0,
-        evaluations=0,
+        quality=PlanQuality(
+            predicted_accuracy_per_test_pose=accuracy,
+            parameter_std=np.full(len(message.parameters), np.nan),
+            criterion=message.criterion,
+            predicted_accuracy=float(message.predicted_accuracy),
+            value=float(message.predicted_accuracy),
+            value_bound=float(message.lower_bound),
+            lower_bound=float(message.lower_bound),
+            efficiency=float(message.efficiency),
+            bound=message.bound,
+            status=status,
+            message=message.message,
+            seconds=float(message.seconds),
+            seed=int(message.seed),
+        ),
     )
     return ReceivedPlan(message.plan_id, plan)
 

@@ -17,7 +17,16 @@ import numpy as np
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.io import config_folder, read_constraints
-from calib_planner.planning import Constraint, ModelDiscrepancy, Plan, PlanProblem, Progress, plan
+from calib_planner.planning import (
+    Candidates,
+    Constraint,
+    ModelDiscrepancy,
+    Plan,
+    PlanProblem,
+    Progress,
+    Search,
+    plan,
+)
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import check_rows
 from calib_planner.ros.model import Model, NotReady, shipped_model
@@ -72,10 +81,10 @@ def answer(
         return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), cut(error))
     except InfeasibleError as error:
         return Answer("INFEASIBLE", cut(error.constraint), cut(error))
-    if found.status == "singular":
-        return Answer("INFEASIBLE", "configurations", found.message)
-    status = "CANCELLED" if found.status == "cancelled" else "SUCCESS"
-    return Answer(status, "", found.message, found, model)
+    if found.quality.status == "singular":
+        return Answer("INFEASIBLE", "configurations", found.quality.message)
+    status = "CANCELLED" if found.quality.status == "cancelled" else "SUCCESS"
+    return Answer(status, "", found.quality.message, found, model)
 
 
 def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanProblem:
@@ -111,14 +120,12 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         size,
         repetitions=int(request.repetitions) or settings.repetitions,
         weights=_weights(request),
-        sigma=sigma or settings.sigma,
+        noise=sigma or settings.sigma,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        candidates=candidates,
         discrepancy=ModelDiscrepancy() if real else None,
-        starts=settings.starts,
-        seed=int(request.seed),
-        time_limit=limit or settings.time_limit,
+        search=Search(starts=settings.starts, seed=int(request.seed), time_limit=limit or settings.time_limit),
+        candidates=None if candidates is None else Candidates(candidates),
     )
 
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, frozen
-from calib_planner.planning import Plan, PlanProblem, WorkspaceBox, plain, plan, plan_space, random_accuracies
+from calib_planner.arrays import FloatArray, frozen, plain
+from calib_planner.planning import Plan, PlanProblem, Search, WorkspaceBox, plan, plan_space, random_accuracies
 from calib_planner.robot import Robot
 from calib_planner_paper import printed
 from calib_planner_paper.calibrations import Calibrations, Laboratory, calibrate, error_covariance
@@ -89,8 +89,8 @@ class Table2:
             "random, min": lambda m: float(self.random[m][0]),
             "random, mean": lambda m: float(self.random[m].mean()),
             "random, median": lambda m: float(np.median(self.random[m])),
-            "proposed": lambda m: self.plans[m].predicted_accuracy,
-            "lower bound": lambda m: self.plans[m].lower_bound,
+            "proposed": lambda m: self.plans[m].quality.predicted_accuracy,
+            "lower bound": lambda m: self.plans[m].quality.lower_bound,
         }
         return {row: tuple(of(m) / r**0.5 for m, r in printed.SIZES) for row, of in statistics.items()}
 
@@ -144,22 +144,21 @@ def kuka_problem(pose: ChosenPose, configurations: int, repetitions: int = 1, *,
         pose.configuration,
         configurations,
         repetitions,
-        sigma=SIGMA,
+        noise=SIGMA,
         constraints=(WORKSPACE,),
-        starts=pose.starts,
-        seed=seed,
+        search=Search(starts=pose.starts, seed=seed),
     )
 
 
 def _summary(found: Plan) -> dict[str, Any]:
     return {
         "configurations": found.configurations,
-        "predicted_accuracy": found.predicted_accuracy,
-        "lower_bound": found.lower_bound,
-        "efficiency": found.efficiency,
-        "bound": found.bound,
-        "general_accuracy": found.general_accuracy,
-        "status": found.status,
+        "predicted_accuracy": found.quality.predicted_accuracy,
+        "lower_bound": found.quality.lower_bound,
+        "efficiency": found.quality.efficiency,
+        "bound": found.quality.bound,
+        "general_accuracy": found.quality.general_accuracy,
+        "status": found.quality.status,
     }
 
 

@@ -226,7 +226,7 @@ def table_2_values(tables: Sequence[Table2]) -> dict[str, str]:
     first = tables[0]
     box = zip("xyz", np.asarray(WORKSPACE.low), np.asarray(WORKSPACE.high), strict=True)
     poses = [f"{t.pose.name}: ({_angles(t)}), {t.pose.why}" for t in tables]
-    bounds = {plan.bound for one in tables for plan in one.plans.values()}
+    bounds = {plan.quality.bound for one in tables for plan in one.plans.values()}
     return {
         "workspace": ", ".join(f"{n} {signed(a, 1)} … {signed(b, 1)} m" for n, a, b in box),
         "poses": listed(poses),
@@ -238,7 +238,7 @@ def table_2_values(tables: Sequence[Table2]) -> dict[str, str]:
         "tail_3": f"{first.tail(3):.1f}",
         "tail_4": f"{first.tail(4):.1f}",
         "tail_12": f"{first.tail(12):.1f}",
-        "elsewhere": ", ".join(micrometres(first.plans[m].general_accuracy) for m in SEPARATE),
+        "elsewhere": ", ".join(micrometres(first.plans[m].quality.general_accuracy) for m in SEPARATE),
         "contradictions": "\n".join(_contradictions()),
     }
 

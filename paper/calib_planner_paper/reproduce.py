@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from calib_planner.arrays import check_count
-from calib_planner.planning import plain
+from calib_planner.arrays import check_count, plain
 from calib_planner_paper import printed
 from calib_planner_paper.kuka import ROBOT, SIGMA, TEST_POSES, WORKSPACE, Figure5, Table2, figure_5, table_2
 from calib_planner_paper.two_link import FIGURE_2, FIGURE_3, Table1, TwoLinkFigure, table_1, two_link_figure

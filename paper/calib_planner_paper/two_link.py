@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.planning import Plan, PlanProblem, plan
+from calib_planner.planning import Plan, PlanProblem, Search, plan
 from calib_planner.robot import Robot
 from calib_planner_paper import printed
 from calib_planner_paper.calibrations import Calibrations, Laboratory, calibrate, error_covariance
@@ -112,9 +112,9 @@ def _column(q20: float, variance: float, gain: float, seed: int) -> Column:
         printed=variance,
         printed_gain=gain,
         closed_form=least_variance(CONFIGURATIONS, q20),
-        planned=found.predicted_accuracy**2,
-        lower_bound=found.lower_bound**2,
-        bound=found.bound,
+        planned=found.quality.predicted_accuracy**2,
+        lower_bound=found.quality.lower_bound**2,
+        bound=found.quality.bound,
         d_optimal=float(np.trace(error_covariance(two_link(LENGTHS), D_OPTIMAL, 1, pose, 1.0))),
     )
 
@@ -122,7 +122,11 @@ def _column(q20: float, variance: float, gain: float, seed: int) -> Column:
 def _plan(q20: float, seed: int) -> Plan:
     """The paper's plain criterion with σ = 1."""
     problem = PlanProblem(
-        two_link(LENGTHS), [0.0, q20], CONFIGURATIONS, sigma=1.0, general_weight=0.0, starts=16, seed=seed
+        two_link(LENGTHS),
+        [0.0, q20],
+        CONFIGURATIONS,
+        noise=1.0,
+        search=Search(general_weight=0.0, starts=16, seed=seed),
     )
     return plan(problem, prove=True)
 
@@ -231,11 +235,12 @@ def two_link_figure(settings: FigureSettings, count: int, seed: int) -> TwoLinkF
         calibrate(laboratory, name, bent(angles), 1, first + k)
         for k, (name, angles) in enumerate(zip("abc", settings.angles, strict=True))
     )
-    problem = PlanProblem(robot, TEST_POSE, len(settings.angles[0]), sigma=SIGMA, starts=16, seed=seed)
-    found = plan(problem, prove=True)
-    return TwoLinkFigure(
-        settings, (a, b, c), found.predicted_accuracy, found.configurations, found.lower_bound, found.bound
+    problem = PlanProblem(
+        robot, TEST_POSE, len(settings.angles[0]), noise=SIGMA, search=Search(starts=16, seed=seed)
     )
+    best = plan(problem, prove=True)
+    accuracy, bound = best.quality.predicted_accuracy, best.quality.lower_bound
+    return TwoLinkFigure(settings, (a, b, c), accuracy, best.configurations, bound, best.quality.bound)
 
 
 # ── Fig. 2: the link lengths of the two-link arm from two measurements. Plan c is (19), plan b D-optimal ────

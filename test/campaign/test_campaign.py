@@ -10,7 +10,7 @@ from calib_planner import InfeasibleError, InputError, PlanProblem, UnknownNameE
 from calib_planner.campaign import CampaignProblem, Measure, begin, decide, run_campaign
 from calib_planner.campaign.batch import APART
 from calib_planner.identification import IdentificationProblem
-from calib_planner.planning import plan_for_accuracy
+from calib_planner.planning import Search, plan_for_accuracy
 from calib_planner.simulation import simulated
 
 
@@ -26,7 +26,7 @@ def test_twenty_robots_are_as_good_as_predicted():
         used.append(result.rounds[-1].measured)
     assert max(ratios) < 3.0
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
-    needed = plan_for_accuracy(PlanProblem(problem.robot, problem.test_pose_array, 2, sigma=SIGMA), 12e-6).plan
+    needed = plan_for_accuracy(PlanProblem(problem.robot, problem.test_pose_array, 2, noise=SIGMA), 12e-6).plan
     # σ is believed unless the residuals contradict it: all but one or two campaigns take what must be.
     assert np.median(used) <= needed.measurements + 2
 
@@ -34,8 +34,8 @@ def test_twenty_robots_are_as_good_as_predicted():
 @pytest.fixture(scope="module")
 def needed() -> int:
     """Measurements of a plan made beforehand for 10 µm."""
-    found = plan(PlanProblem(kuka().robot, POSE, 4, repetitions=7, sigma=SIGMA, starts=4))
-    assert found.value <= 10e-6
+    found = plan(PlanProblem(kuka().robot, POSE, 4, repetitions=7, noise=SIGMA, search=Search(starts=4)))
+    assert found.quality.value <= 10e-6
     return found.measurements
 
 

@@ -321,3 +321,19 @@ def test_real_robots_are_planned_with_their_systematic_errors(call: Any, tmp_pat
     assert "systematic errors" not in paper["message"]
     assert real["configurations"] != paper["configurations"]
     assert paper["predicted_accuracy"] <= real["predicted_accuracy"]
+
+
+HEAVY = ("scipy.stats", "scipy.spatial", "scipy.linalg", "matplotlib", "sqlite3", "jinja2", "rosbags")
+"""Packages that take a tenth of a second or more each and that few commands use."""
+
+
+@pytest.mark.parametrize("words", [["--help"], ["robots", "list"], ["robots", "show", "ur10e"]], ids=" ".join)
+def test_short_commands_import_what_they_use(words: list[str]) -> None:
+    script = f"""
+import sys
+from calib_planner.cli import main
+assert main({words!r}) == 0
+print([name for name in {HEAVY!r} if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr

@@ -47,9 +47,8 @@ def test_all_files_and_the_json_of_a_shipped_robot(plan_file, tmp_path, capsys):
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
     assert found["id"] == plan_identity(plan) and found["visible"] is None and found["reachable"] is True
     assert [list(s["joints"].values()) for s in found["stops"]] == plan.configurations.tolist()
-    assert (
-        found["stops"][0]["travel"]["joint_a1"] is None and found["predicted_accuracy"] == plan.predicted_accuracy
-    )
+    assert found["stops"][0]["travel"]["joint_a1"] is None
+    assert found["predicted_accuracy"] == plan.quality.predicted_accuracy
     q, repetitions = read_plan_csv(folder / "plan_sheet.csv", Robot.load("kuka_kr270"))
     np.testing.assert_array_equal(q, plan.configurations)
     np.testing.assert_array_equal(repetitions, 2)

@@ -8,6 +8,7 @@ from stores import opened
 
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.io import CampaignStore
+from calib_planner.planning import Search
 
 
 @pytest.fixture
@@ -20,4 +21,4 @@ def store(tmp_path: Path) -> Iterator[CampaignStore]:
 @pytest.fixture(scope="module")
 def planned() -> Plan:
     robot = Robot.load("planar_2r").with_parameters("lengths+offsets")
-    return plan(PlanProblem(robot, [0.3, 0.5], 4, starts=4))
+    return plan(PlanProblem(robot, [0.3, 0.5], 4, search=Search(starts=4)))

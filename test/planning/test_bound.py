@@ -10,7 +10,7 @@ import pytest
 from robots import mixed, random_configurations
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
-from calib_planner.planning import plan_space
+from calib_planner.planning import Candidates, PlanPrior, Search, plan_space
 from calib_planner.planning.bound import RelaxedProblem, maximise_sensitivity, relaxed_design
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
@@ -61,14 +61,12 @@ def random_problem(seed: int) -> PlanProblem:
         robot,
         random_configurations(robot, int(rng.integers(1, 4)), seed),
         len(names) + int(rng.integers(0, 3)),
-        sigma=float(rng.uniform(0.1, 1.0)),
+        noise=float(rng.uniform(0.1, 1.0)),
         criterion=str(rng.choice(["test_pose", "test_pose", "worst_pose", "d", "a", "e", "d_star", "o5"])),
-        configuration_sigma=float(rng.choice([0.0, 0.3])),
+        repeatability=float(rng.choice([0.0, 0.3])),
         repetitions=int(rng.integers(1, 3)),
-        prior_std={names[0]: 0.5} if rng.random() < 0.3 else {},
-        general_weight=0.0,
-        starts=4,
-        seed=seed,
+        prior=PlanPrior(std={names[0]: 0.5} if rng.random() < 0.3 else {}),
+        search=Search(general_weight=0.0, starts=4, seed=seed),
     )
 
 
@@ -82,7 +80,7 @@ def proven(problem: PlanProblem, rounds: int = 60):
     """The parts of a plan with a proven bound, not yet made into one."""
     space = plan_space(problem)
     asked = relaxed_problem(space)
-    rng = np.random.default_rng(problem.seed)
+    rng = np.random.default_rng(problem.search.seed)
     design = relaxed_design(asked, problem.test_pose_array, rng, rounds=rounds)
     return space, asked, design, *prove_bound(asked, design, rng)
 
@@ -137,7 +135,7 @@ PLANAR = list(itertools.product(["l1,l2", "dq1,dq2"], [2, 3, 5], [3, 41, 77, 118
 def test_proven_bound_of_the_two_link_arm_is_equation_20(pair, m, degrees):
     robot = Robot.load("planar_2r").with_parameters(pair)
     q0 = np.radians([17.0 * m, degrees])
-    problem = PlanProblem(robot, q0, m, sigma=1.0, general_weight=0.0, starts=8)
+    problem = PlanProblem(robot, q0, m, noise=1.0, search=Search(general_weight=0.0, starts=8))
     _, _, design, bounded, proof = proven(problem)
     best = (1 + abs(np.sin(q0[1]))) / m  # (20)
     assert proof.active in ((1,), ())  # at the optimum d is constant: (B) is an equality for every plan
@@ -151,7 +149,7 @@ def test_equation_20_to_the_tolerance_of_the_proof():
     robot = Robot.load("planar_2r").with_parameters("l1,l2")
     for degrees, m in itertools.product([20, 65, 130], [2, 4]):
         q0 = np.radians([0.0, degrees])
-        problem = PlanProblem(robot, q0, m, sigma=1.0, general_weight=0.0)
+        problem = PlanProblem(robot, q0, m, noise=1.0, search=Search(general_weight=0.0))
         space = plan_space(problem)
         asked = relaxed_problem(space)
         angle = np.arccos((1 - abs(np.sin(q0[1]))) / np.cos(q0[1]))  # (19)
@@ -168,13 +166,13 @@ def test_no_plan_of_the_kuka_beats_its_bound(seed):
     robot = Robot.load("kuka_kr270")
     q0 = random_configurations(robot, 1, seed)
     m = (3, 4, 6, 12)[seed]
-    found = plan(PlanProblem(robot, q0, m, starts=4, general_weight=0.0, seed=seed), prove=True)
-    assert found.bound == "proven"
-    assert "proven to" in found.message
-    assert found.efficiency <= 1.0 + SLACK
-    assert found.lower_bound <= found.predicted_accuracy * (1 + SLACK)
+    found = plan(PlanProblem(robot, q0, m, search=Search(starts=4, general_weight=0.0, seed=seed)), prove=True)
+    assert found.quality.bound == "proven"
+    assert "proven to" in found.quality.message
+    assert found.quality.efficiency <= 1.0 + SLACK
+    assert found.quality.lower_bound <= found.quality.predicted_accuracy * (1 + SLACK)
     space = plan_space(PlanProblem(robot, q0, m))
-    assert best_worth_of_random_plans(space, 300, seed) <= found.lower_bound**-2 * (1 + SLACK)
+    assert best_worth_of_random_plans(space, 300, seed) <= found.quality.lower_bound**-2 * (1 + SLACK)
 
 
 # ── the proof itself ─────────────────────────────────────────────────────────────────────────────────
@@ -193,7 +191,7 @@ def test_proven_maximum_is_above_every_sample_and_every_polished_maximum(problem
     space, asked, _, bounded, proof = proven(problem, rounds=10)
     q = random_configurations(space.robot, 100_000, 7)
     jacobian = np.ascontiguousarray(space.robot.jacobian(q))
-    height = np.sum((jacobian @ square_root(bounded.slope)) ** 2, axis=(1, 2)) / problem.sigma**2
+    height = np.sum((jacobian @ square_root(bounded.slope)) ** 2, axis=(1, 2)) / problem.instrument.typical**2
     assert height.max() <= proof.maximum_upper
     peaks = maximise_sensitivity(asked, bounded.slope, q[np.argsort(-height)[:40]])
     assert np.exp(-peaks.value.min()) <= proof.maximum_upper * (1 + SLACK)
@@ -326,21 +324,21 @@ def test_a_maximum_that_search_missed_is_found_and_repaired():
 def test_noise_without_a_polynomial_stays_numerical_and_says_so():
     robot = Robot.load("planar_2r")
     noise = LaserTracker(station=[4.0, 0.0, 1.0])
-    found = plan(PlanProblem(robot, [0.3, 0.5], 4, noise=noise, starts=4), prove=True)
-    assert found.bound == "numerical"
-    assert "isotropic" in found.message
+    found = plan(PlanProblem(robot, [0.3, 0.5], 4, noise=noise, search=Search(starts=4)), prove=True)
+    assert found.quality.bound == "numerical"
+    assert "isotropic" in found.quality.message
 
 
 def test_pools_are_proven_by_looking_at_every_candidate():
     robot = Robot.load("kuka_kr270")
     pool = random_configurations(robot, 60, 2)
-    found = plan(PlanProblem(robot, TEST_POSE, 5, candidates=pool), prove=True)
-    assert found.bound == "proven"
-    assert "candidate" in found.message
-    assert found.lower_bound <= found.predicted_accuracy * (1 + SLACK)
+    found = plan(PlanProblem(robot, TEST_POSE, 5, candidates=Candidates(pool)), prove=True)
+    assert found.quality.bound == "proven"
+    assert "candidate" in found.quality.message
+    assert found.quality.lower_bound <= found.quality.predicted_accuracy * (1 + SLACK)
 
 
 def test_without_prove_nothing_claims_to_be_proven():
-    found = plan(PlanProblem(Robot.load("planar_2r"), [0.3, 0.5], 4, starts=4))
-    assert found.bound == "numerical"
-    assert "proven" not in found.message
+    found = plan(PlanProblem(Robot.load("planar_2r"), [0.3, 0.5], 4, search=Search(starts=4)))
+    assert found.quality.bound == "numerical"
+    assert "proven" not in found.quality.message

@@ -6,20 +6,30 @@ import numpy as np
 import pytest
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, plan
-from calib_planner.planning import compare, plan_for_accuracy, plan_space, random_accuracies, split_budget
+from calib_planner.planning import (
+    PlanPrior,
+    Search,
+    compare,
+    plan_for_accuracy,
+    plan_space,
+    random_accuracies,
+    split_budget,
+)
 from calib_planner.planning.planner import worth_of
 
 POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 
 
 def problem(**changes):
-    return PlanProblem(Robot.load("kuka_kr270"), POSE, **{"configurations": 4, "starts": 8, **changes})
+    return PlanProblem(
+        Robot.load("kuka_kr270"), POSE, **{"configurations": 4, "search": Search(starts=8), **changes}
+    )
 
 
 def two_link(degrees=50.0, **changes):
     robot = Robot.load("planar_2r").with_parameters("l1,l2")
     q0 = np.radians([10.0, degrees])
-    settings = {"configurations": 2, "starts": 8, "sigma": 1.0, "general_weight": 0.0, **changes}
+    settings = {"configurations": 2, "search": Search(starts=8, general_weight=0.0), "noise": 1.0, **changes}
     return PlanProblem(robot, q0, **settings)
 
 
@@ -33,16 +43,16 @@ def test_fewest_measurements_of_the_two_link_arm(accuracy):
     """Equation (20): n ≥ (1 + |sin q20|) / ρ²; the split found uses exactly that many."""
     found = plan_for_accuracy(two_link(), accuracy)
     least = max(int(np.ceil((1 + np.sin(np.radians(50.0))) / accuracy**2)), 1)
-    assert found.plan.value <= accuracy
+    assert found.plan.quality.value <= accuracy
     assert found.fewest <= least <= found.plan.measurements <= least + 1
 
 
 def test_accuracy_with_an_error_that_repetition_does_not_average():
     """σ_c makes repetition worth less: more configurations, and still the accuracy asked for."""
     plain = plan_for_accuracy(two_link(), 0.4).plan
-    rough = plan_for_accuracy(two_link(configuration_sigma=2 / 3), 0.4).plan
-    assert plain.value <= 0.4
-    assert rough.value <= 0.4
+    rough = plan_for_accuracy(two_link(repeatability=2 / 3), 0.4).plan
+    assert plain.quality.value <= 0.4
+    assert rough.quality.value <= 0.4
     assert rough.measurements > plain.measurements
     assert len(rough.configurations) >= len(plain.configurations)
 
@@ -59,11 +69,11 @@ def test_budget_prefers_few_configurations():
         (3, 4), (4, 3), (6, 2), (12, 1)
     }  # fmt: skip
     assert len(found.plan.configurations) <= 4
-    assert found.plan.value <= 1.01 * min(p.value for p in found.tried)
+    assert found.plan.quality.value <= 1.01 * min(p.quality.value for p in found.tried)
 
 
 def test_budget_with_repeatability_prefers_many_configurations():
-    found = split_budget(problem(starts=24, configuration_sigma=1e-4), 12)
+    found = split_budget(problem(search=Search(starts=24), repeatability=1e-4), 12)
     assert len(found.plan.configurations) >= 6
 
 
@@ -78,7 +88,7 @@ def test_only_criteria_in_metres():
 
 
 def test_value_of_given_configurations_is_the_plans(planned):
-    assert worth_of(problem(), planned.configurations) == pytest.approx(planned.value, rel=1e-6)
+    assert worth_of(problem(), planned.configurations) == pytest.approx(planned.quality.value, rel=1e-6)
 
 
 def test_repetition_is_as_good_as_measuring_again(planned):
@@ -86,7 +96,7 @@ def test_repetition_is_as_good_as_measuring_again(planned):
     q = planned.configurations
     once = worth_of(problem(), q)
     assert worth_of(problem(repetitions=9), q) == pytest.approx(once / 3, rel=1e-9)
-    rough = worth_of(problem(configuration_sigma=3e-5, repetitions=10_000), q)
+    rough = worth_of(problem(repeatability=3e-5, repetitions=10_000), q)
     assert rough == pytest.approx(once, rel=1e-3)
 
 
@@ -118,13 +128,13 @@ def test_prior_and_measured_replace_measurements(planned):
 
     robot = Robot.load("kuka_kr270")
     data = SimulatedCell(robot, {}, 3e-5).measure(planned.configurations, 1, 0)
-    more = plan(problem(configurations=1, measured=data))
-    assert more.value < planned.value
-    assert more.lower_bound <= more.value
+    more = plan(problem(configurations=1, prior=PlanPrior(measured=data)))
+    assert more.quality.value < planned.quality.value
+    assert more.quality.lower_bound <= more.quality.value
     rows = np.concatenate([planned.configurations, more.configurations])
-    assert more.value == pytest.approx(worth_of(problem(configurations=5), rows), rel=1e-6)
-    known = plan(problem(prior_std={name: 1e-9 for name in robot.parameter_names if name != "q1"}))
-    assert known.value < planned.value
+    assert more.quality.value == pytest.approx(worth_of(problem(configurations=5), rows), rel=1e-6)
+    known = plan(problem(prior=PlanPrior({name: 1e-9 for name in robot.parameter_names if name != "q1"})))
+    assert known.quality.value < planned.quality.value
 
 
 def test_next_plan_needs_a_prior_for_what_it_cannot_identify_alone():

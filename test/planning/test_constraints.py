@@ -12,11 +12,13 @@ from robots import CASES, mixed, random_configurations
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, UnknownNameError, plan
 from calib_planner.planning import (
+    Candidates,
     Feasibility,
     JointRange,
     LineOfSight,
     MinimumHeight,
     ReflectorAcceptance,
+    Search,
     TrackerElevation,
     TrackerRange,
     WorkspaceBox,
@@ -293,12 +295,12 @@ def test_candidates_that_no_constraint_leaves():
     pool = random_configurations(robot, 300)
     box = WorkspaceBox([1.0, -3, 0], [3, 3, 3])
     left = int(box.allowed(robot, pool).sum())
-    fits = plan(PlanProblem(robot, TEST_POSE, 6, constraints=(box,), candidates=pool))
+    fits = plan(PlanProblem(robot, TEST_POSE, 6, constraints=(box,), candidates=Candidates(pool)))
     assert box.allowed(robot, fits.configurations).all()
     with pytest.raises(InfeasibleError, match=f"{left} of 300.*workspace box allows"):
-        plan(PlanProblem(robot, TEST_POSE, left + 1, constraints=(box,), candidates=pool))
+        plan(PlanProblem(robot, TEST_POSE, left + 1, constraints=(box,), candidates=Candidates(pool)))
     with pytest.raises(InfeasibleError) as caught:
-        plan(PlanProblem(robot, TEST_POSE, 4, constraints=(MinimumHeight(5.0),), candidates=pool))
+        plan(PlanProblem(robot, TEST_POSE, 4, constraints=(MinimumHeight(5.0),), candidates=Candidates(pool)))
     assert caught.value.constraint == "minimum height"
 
 
@@ -333,14 +335,14 @@ def test_joint_ranges_cost_nothing_however_narrow():
     q = Feasibility(robot, (narrow,)).sample(np.random.default_rng(0), 100)
     assert (np.abs(q - TEST_POSE) <= 0.03 + 1e-12).all()
     outside = TEST_POSE + np.array([1.0, 0, 0, 0, 0, 0])
-    found = plan(PlanProblem(robot, outside, 6, constraints=(narrow,), starts=8))
+    found = plan(PlanProblem(robot, outside, 6, constraints=(narrow,), search=Search(starts=8)))
     assert narrow.allowed(robot, found.configurations).all()
 
 
 @pytest.fixture(scope="module")
 def constrained():
     robot = Robot.load("kuka_kr270")
-    return plan(PlanProblem(robot, TEST_POSE, 6, constraints=all_constraints(), starts=2))
+    return plan(PlanProblem(robot, TEST_POSE, 6, constraints=all_constraints(), search=Search(starts=2)))
 
 
 def test_a_plan_satisfies_every_constraint(constrained):
@@ -374,8 +376,8 @@ def test_the_bound_holds_for_feasible_plans(constrained):
         stacked = robot.jacobian(rows).reshape(-1, 9)
         values.append(3e-5 * np.sqrt(np.trace(j0 @ np.linalg.pinv(stacked.T @ stacked) @ j0.T)))
     assert constrained.lower_bound <= constrained.predicted_accuracy < min(values)
-    unconstrained = plan(PlanProblem(robot, TEST_POSE, 6, starts=8))
-    assert unconstrained.lower_bound <= constrained.lower_bound * (1 + 1e-2)
+    unconstrained = plan(PlanProblem(robot, TEST_POSE, 6, search=Search(starts=8)))
+    assert unconstrained.quality.lower_bound <= constrained.lower_bound * (1 + 1e-2)
 
 
 def test_the_order_of_visit_is_the_shorter_one(constrained):

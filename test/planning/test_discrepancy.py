@@ -10,7 +10,7 @@ from robots import SHARED_DATA, mixed, random_configurations
 
 from calib_planner import Robot
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.planning import ModelDiscrepancy, PlanProblem, plan
+from calib_planner.planning import Candidates, ModelDiscrepancy, PlanProblem, plan
 from calib_planner.planning.search.prediction import (
     PredictionModel,
     PredictionProblem,
@@ -30,10 +30,10 @@ def request(
         random_configurations(robot, 3, 5),
         size,
         weights=[1.0, 2.0, 3.0],
-        candidates=random_configurations(robot, pool, 6),
         discrepancy=discrepancy,
+        candidates=Candidates(random_configurations(robot, pool, 6)),
     )
-    return prediction_problem(problem, np.asarray(problem.candidates))
+    return prediction_problem(problem, problem.candidate_array)
 
 
 def dense(problem: PredictionProblem, rows: list[int]) -> float:
@@ -115,7 +115,13 @@ def test_choice_against_every_subset() -> None:
 def test_a_shared_joint_angle_is_worth_less() -> None:
     robot = Robot.load("planar_2r")
     pool = np.array([[0.3, 1.0], [0.3, -1.0], [0.9, -1.0]])  # the third is the second, turned
-    asked = PlanProblem(robot, [[-0.9, 0.4]], 2, candidates=pool, discrepancy=ModelDiscrepancy(joint_length=0.2))
+    asked = PlanProblem(
+        robot,
+        [[-0.9, 0.4]],
+        2,
+        discrepancy=ModelDiscrepancy(joint_length=0.2),
+        candidates=Candidates(pool),
+    )
     model = PredictionModel(prediction_problem(asked, pool))
     assert model.error([0, 2]) < model.error([0, 1])
 
@@ -132,11 +138,13 @@ def test_measured_configurations_count() -> None:
 def test_through_the_planner() -> None:
     robot = Robot.load("kuka_kr270")
     candidates = random_configurations(robot, 60, 1)
-    problem = PlanProblem(robot, candidates[:5], 6, candidates=candidates, discrepancy=ModelDiscrepancy())
+    problem = PlanProblem(
+        robot, candidates[:5], 6, discrepancy=ModelDiscrepancy(), candidates=Candidates(candidates)
+    )
     found, again = plan(problem), plan(problem)
     np.testing.assert_array_equal(found.configurations, again.configurations)
     assert len(np.unique(found.configurations, axis=0)) == 6
-    assert 0 < found.efficiency <= 1
+    assert 0 < found.quality.efficiency <= 1
 
 
 @pytest.mark.parametrize(
@@ -145,7 +153,8 @@ def test_through_the_planner() -> None:
 )
 def test_what_it_cannot_be_combined_with(options: dict[str, object]) -> None:
     robot = Robot.load("planar_2r")
-    given = {"candidates": random_configurations(robot, 9), "discrepancy": ModelDiscrepancy()} | options
+    candidates = Candidates(random_configurations(robot, 9))
+    given = {"candidates": candidates, "discrepancy": ModelDiscrepancy()} | options
     with pytest.raises(InputError, match="discrepancy"):
         PlanProblem(robot, [[0.1, 0.2]], 2, **given)  # type: ignore[arg-type]
 

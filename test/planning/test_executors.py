@@ -14,11 +14,12 @@ import pytest
 from robots import CASES, mixed
 
 from calib_planner import Plan, PlanProblem, Robot, plan
+from calib_planner.planning import Search
 from calib_planner.planning.search.multistart import CHUNKS, parts
 
 
 def problem() -> PlanProblem:
-    return PlanProblem(Robot.load("planar_2r"), [0.2, 0.9], 4, starts=8, seed=5)
+    return PlanProblem(Robot.load("planar_2r"), [0.2, 0.9], 4, search=Search(starts=8, seed=5))
 
 
 @contextmanager
@@ -59,9 +60,9 @@ def test_same_seed_same_plan_whatever_the_executor(workers, alone, tmp_path):
     with workers(tmp_path) as executor:
         found = plan(problem(), executor=executor)
     np.testing.assert_array_equal(found.configurations, alone.configurations)
-    assert found.predicted_accuracy == alone.predicted_accuracy
-    assert found.lower_bound == alone.lower_bound
-    assert (found.starts, found.evaluations) == (alone.starts, alone.evaluations)
+    assert found.quality.predicted_accuracy == alone.quality.predicted_accuracy
+    assert found.quality.lower_bound == alone.quality.lower_bound
+    assert (found.quality.starts, found.quality.evaluations) == (alone.quality.starts, alone.quality.evaluations)
 
 
 class Backwards(Executor):
@@ -92,9 +93,9 @@ def test_order_of_completion_does_not_matter(alone):
 def test_cancelling_with_an_executor_returns_a_valid_plan():
     with ThreadPoolExecutor(2) as pool:
         found = plan(problem(), lambda progress: progress.starts_done > 0, executor=pool)
-    assert found.status == "cancelled"
+    assert found.quality.status == "cancelled"
     assert found.configurations.shape == (4, 2)
-    assert found.lower_bound <= found.predicted_accuracy
+    assert found.quality.lower_bound <= found.quality.predicted_accuracy
 
 
 def test_many_starts_are_cut_into_more_parts():
@@ -118,7 +119,7 @@ def test_robots_and_problems_survive_pickling(name):
 
 
 def test_plans_survive_pickling():
-    found = plan(PlanProblem(mixed().with_parameters("offsets"), np.zeros(4), 3, starts=4))
+    found = plan(PlanProblem(mixed().with_parameters("offsets"), np.zeros(4), 3, search=Search(starts=4)))
     copy = pickle.loads(pickle.dumps(found))
     np.testing.assert_array_equal(copy.configurations, found.configurations)
     assert copy.to_dict() == found.to_dict()

@@ -10,7 +10,7 @@ import pytest
 from robots import mixed, random_configurations
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, UnknownNameError, plan
-from calib_planner.planning import visiting_order
+from calib_planner.planning import Search, visiting_order
 from calib_planner.planning.search.descent import descend
 
 TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
@@ -24,34 +24,36 @@ def kuka():
 def test_plan_is_near_its_bound(m):
     """The continuous problem ends at m·ρ0²/σ² = 3 for this test pose."""
     found = plan(PlanProblem(kuka(), TEST_POSE, m))
-    assert found.status == "ok"
-    assert found.lower_bound <= 3e-5 * np.sqrt(3.0 / m) * (1 + 1e-6)
-    assert 0.9 < found.efficiency <= 1.0
+    assert found.quality.status == "ok"
+    assert found.quality.lower_bound <= 3e-5 * np.sqrt(3.0 / m) * (1 + 1e-6)
+    assert 0.9 < found.quality.efficiency <= 1.0
     low, high = kuka().joint_limits.T
     assert ((low <= found.configurations) & (found.configurations <= high)).all()
-    assert np.isfinite(found.parameter_std).all()
+    assert np.isfinite(found.quality.parameter_std).all()
 
 
 def test_predicted_accuracy_is_equation_14():
     robot = kuka()
     poses = random_configurations(robot, 3, 4)
-    found = plan(PlanProblem(robot, poses, 5, repetitions=2, weights=[1, 2, 1], sigma=1e-4, starts=8))
+    found = plan(
+        PlanProblem(robot, poses, 5, repetitions=2, weights=[1, 2, 1], noise=1e-4, search=Search(starts=8))
+    )
     rows = np.repeat(found.configurations, 2, axis=0)
     stacked = robot.jacobian(rows).reshape(-1, 9)
     cov = 1e-8 * np.linalg.inv(stacked.T @ stacked)
     expected = [np.sqrt(np.trace(j @ cov @ j.T)) for j in robot.jacobian(poses)]
-    np.testing.assert_allclose(found.predicted_accuracy_per_test_pose, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.quality.predicted_accuracy_per_test_pose, expected, rtol=1e-6)
     mean = np.sqrt(np.average(np.square(expected), weights=[1, 2, 1]))
-    assert found.predicted_accuracy == pytest.approx(mean, rel=1e-6)
-    np.testing.assert_allclose(found.parameter_std, np.sqrt(np.diag(cov)), rtol=1e-5)
-    assert found.efficiency == pytest.approx(found.lower_bound / found.predicted_accuracy)
+    assert found.quality.predicted_accuracy == pytest.approx(mean, rel=1e-6)
+    np.testing.assert_allclose(found.quality.parameter_std, np.sqrt(np.diag(cov)), rtol=1e-5)
+    assert found.quality.efficiency == pytest.approx(found.quality.lower_bound / found.quality.predicted_accuracy)
 
 
 def test_same_seed_same_plan():
-    problem = PlanProblem(kuka(), TEST_POSE, 4, starts=8, seed=11)
+    problem = PlanProblem(kuka(), TEST_POSE, 4, search=Search(starts=8, seed=11))
     first, second = plan(problem), plan(problem)
     np.testing.assert_array_equal(first.configurations, second.configurations)
-    other = plan(dataclasses.replace(problem, seed=12))
+    other = plan(dataclasses.replace(problem, search=Search(starts=8, seed=12)))
     assert not np.array_equal(first.configurations, other.configurations)
 
 
@@ -63,16 +65,16 @@ def test_progress_and_cancel_return_a_valid_plan():
         return len(seen) >= 3
 
     found = plan(PlanProblem(kuka(), TEST_POSE, 6), cancel_soon)
-    assert found.status == "cancelled"
+    assert found.quality.status == "cancelled"
     assert found.configurations.shape == (6, 6)
-    assert found.lower_bound <= found.predicted_accuracy
+    assert found.quality.lower_bound <= found.quality.predicted_accuracy
     assert seen[0].starts_total == 48
 
 
 def test_time_limit_returns_a_valid_plan():
-    found = plan(PlanProblem(kuka(), TEST_POSE, 12, time_limit=1e-6))
-    assert found.status == "time_limit"
-    assert np.isfinite(found.predicted_accuracy)
+    found = plan(PlanProblem(kuka(), TEST_POSE, 12, search=Search(time_limit=1e-6)))
+    assert found.quality.status == "time_limit"
+    assert np.isfinite(found.quality.predicted_accuracy)
 
 
 def test_parameters_that_no_plan_can_see_are_named_and_left_out():
@@ -81,23 +83,23 @@ def test_parameters_that_no_plan_can_see_are_named_and_left_out():
     limits = np.array(robot.joint_limits)
     limits[1:] = np.stack([TEST_POSE[1:] - 1e-12, TEST_POSE[1:] + 1e-12], axis=1)
     stiff = dataclasses.replace(robot, joint_limits=limits)
-    found = plan(PlanProblem(stiff, TEST_POSE, 6, starts=4))
-    assert found.status == "ok"
-    assert len(found.unidentifiable) == np.isnan(found.parameter_std).sum() == 6
-    assert found.unidentifiable[0] in found.message
+    found = plan(PlanProblem(stiff, TEST_POSE, 6, search=Search(starts=4)))
+    assert found.quality.status == "ok"
+    assert len(found.quality.unidentifiable) == np.isnan(found.quality.parameter_std).sum() == 6
+    assert found.quality.unidentifiable[0] in found.quality.message
 
 
 def test_unknown_base_and_tool_can_be_planned_for():
     robot = kuka().with_parameters("offsets", ("base", "tool"))
-    found = plan(PlanProblem(robot, TEST_POSE, 8, starts=8))
-    assert np.isfinite(found.predicted_accuracy)
-    assert "1·q1 - 1·base.rz" in found.unidentifiable
+    found = plan(PlanProblem(robot, TEST_POSE, 8, search=Search(starts=8)))
+    assert np.isfinite(found.quality.predicted_accuracy)
+    assert "1·q1 - 1·base.rz" in found.quality.unidentifiable
 
 
 def test_plan_is_immutable_and_plain():
-    found = plan(PlanProblem(kuka(), TEST_POSE, 3, starts=4))
+    found = plan(PlanProblem(kuka(), TEST_POSE, 3, search=Search(starts=4)))
     with pytest.raises(dataclasses.FrozenInstanceError):
-        found.seed = 3
+        found.quality.seed = 3
     with pytest.raises(ValueError, match="read-only"):
         found.configurations[0, 0] = 1.0
     keys = set(json.loads(json.dumps(found.to_dict(), allow_nan=False)))
@@ -130,8 +132,8 @@ def test_visiting_order_shortens_travel():
         ({"configurations": 0}, "configurations", "from 1"),
         ({"configurations": 2.5}, "configurations", "whole number"),
         ({"repetitions": -1}, "repetitions", "from 1"),
-        ({"sigma": 0.0}, "sigma", "(0, 1]"),
-        ({"sigma": float("nan")}, "sigma", "finite"),
+        ({"noise": 0.0}, "sigma", "(0, 1]"),
+        ({"noise": float("nan")}, "sigma", "finite"),
         ({"weights": [1.0, 2.0]}, "weights", "(1)"),
         ({"weights": [0.0]}, "weights", "not all zero"),
         ({"time_limit": 0.0}, "time_limit", "> 0"),
@@ -142,8 +144,9 @@ def test_visiting_order_shortens_travel():
 )
 def test_refusals(change, field, needle):
     values = {"robot": kuka(), "test_poses": TEST_POSE, "configurations": 4, **change}
+    search = {name: values.pop(name) for name in ("time_limit", "seed", "starts") if name in values}
     with pytest.raises(InputError) as caught:
-        PlanProblem(**values)
+        PlanProblem(**values, search=Search(**search))
     assert caught.value.field == field
     assert needle in str(caught.value)
 
@@ -181,6 +184,6 @@ def test_descent_finds_known_minima_in_a_batch():
 
 def test_mixed_robot_with_two_targets_can_be_planned():
     robot = mixed()
-    found = plan(PlanProblem(robot, np.zeros(4), 6, starts=8))
-    assert found.status == "ok"
-    assert found.efficiency <= 1.0
+    found = plan(PlanProblem(robot, np.zeros(4), 6, search=Search(starts=8)))
+    assert found.quality.status == "ok"
+    assert found.quality.efficiency <= 1.0

@@ -10,7 +10,7 @@ from robots import SHARED_DATA, random_configurations
 
 from calib_planner import Robot
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning import PlanProblem, plan
+from calib_planner.planning import Candidates, PlanProblem, Search, plan
 from calib_planner.planning.bound import relax_pool
 from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
 from calib_planner.planning.search.exchange import PoolProblem, RunningDeterminant, choose, pool_rows
@@ -128,25 +128,32 @@ def test_plans_from_candidates(criterion: str) -> None:
     robot = Robot.load("kuka_kr270")
     candidates = random_configurations(robot, 150, 3)
     test_poses = random_configurations(robot, 2, 4)
-    problem = PlanProblem(robot, test_poses, 6, criterion=criterion, candidates=candidates, seed=2)
+    problem = PlanProblem(
+        robot,
+        test_poses,
+        6,
+        criterion=criterion,
+        search=Search(seed=2),
+        candidates=Candidates(candidates),
+    )
     found, again = plan(problem), plan(problem)
     np.testing.assert_array_equal(found.configurations, again.configurations)
     rows = [int(np.flatnonzero((candidates == q).all(axis=1))[0]) for q in found.configurations]
     assert len(set(rows)) == 6
     if criterion in ("o2", "o4"):
-        assert found.bound == "none"
+        assert found.quality.bound == "none"
     else:
-        assert 0.5 < found.efficiency <= 1.0
+        assert 0.5 < found.quality.efficiency <= 1.0
 
 
 def test_repeats_only_when_allowed() -> None:
     robot = Robot.load("planar_2r")
     candidates = np.array([[0.0, 0.8], [0.5, 0.1], [-0.4, 0.2], [1.0, -0.8], [1.5, 0.0], [0.1, 0.05]])
-    once = plan(PlanProblem(robot, [[0.0, 0.8]], 6, candidates=candidates))
-    again = plan(PlanProblem(robot, [[0.0, 0.8]], 6, candidates=candidates, repeat_candidates=True))
+    once = plan(PlanProblem(robot, [[0.0, 0.8]], 6, candidates=Candidates(candidates)))
+    again = plan(PlanProblem(robot, [[0.0, 0.8]], 6, candidates=Candidates(candidates, repeat=True)))
     assert len(np.unique(once.configurations, axis=0)) == 6
     assert len(np.unique(again.configurations, axis=0)) < 6
-    assert again.predicted_accuracy < once.predicted_accuracy
+    assert again.quality.predicted_accuracy < once.quality.predicted_accuracy
 
 
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="no measured data here")
@@ -155,7 +162,7 @@ def test_pool_that_sees_less_than_the_robot_could() -> None:
     robot = robot.with_parameters("full", ("base", "tool"))
     candidates = random_configurations(robot, 200)
     candidates[:, 2:] = candidates[0, 2:]  # only two joints move
-    found = plan(PlanProblem(robot, None, 12, criterion="d", candidates=candidates))
-    assert found.status == "ok"
-    assert len(found.unidentifiable) > 24  # a robot that moves has 24 combinations, this pool sees fewer
-    assert "held at nominal" in found.message
+    found = plan(PlanProblem(robot, None, 12, criterion="d", candidates=Candidates(candidates)))
+    assert found.quality.status == "ok"
+    assert len(found.quality.unidentifiable) > 24  # a robot that moves has 24 combinations, this pool sees fewer
+    assert "held at nominal" in found.quality.message

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib_planner import FileFormatError, InputError, PlanProblem, Robot, plan
-from calib_planner.planning import SelfCollision
+from calib_planner.planning import Search, SelfCollision
 from calib_planner.planning.constraints.self_collision import MissingExtraError
 
 pin = pytest.importorskip("pinocchio")
@@ -96,7 +96,9 @@ def test_joints_in_another_order_are_matched_by_name(arm, tmp_path):
 
 def test_plans_avoid_collisions(arm):
     robot, free = arm
-    found = plan(PlanProblem(robot.with_parameters("offsets"), [0.3, 0.5], 3, constraints=(free,), starts=4))
+    found = plan(
+        PlanProblem(robot.with_parameters("offsets"), [0.3, 0.5], 3, constraints=(free,), search=Search(starts=4))
+    )
     assert SelfCollision(free.urdf_path).allowed(robot, found.configurations).all()
 
 

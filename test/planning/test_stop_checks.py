@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import mixed, plan_of, random_configurations
+from robots import changed, mixed, plan_of, random_configurations
 from scipy.spatial.transform import Rotation
 
 from calib_planner import Robot
@@ -136,7 +136,7 @@ def test_a_sheet_keeps_the_plan_and_its_order(kuka):
 def test_identity_is_that_of_what_is_measured(kuka):
     q = random_configurations(kuka, 5, 2)
     plan = plan_of(kuka, q)
-    assert plan_identity(plan) == plan_identity(replace(plan, seconds=7.0, message="other"))
+    assert plan_identity(plan) == plan_identity(changed(plan, seconds=7.0, message="other"))
     nudged = q.copy()
     nudged[4, 5] = np.nextafter(q[4, 5], 9)
     others = [plan_of(kuka, nudged), plan_of(kuka, q, 2), plan_of(kuka, q[::-1])]

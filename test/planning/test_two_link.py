@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib_planner import PlanProblem, Robot, plan
-from calib_planner.planning import InformationModel, covariance, error_variance
+from calib_planner.planning import InformationModel, Search, covariance, error_variance
 from calib_planner.tracker import Isotropic
 
 PAIRS = ["l1,l2", "dq1,dq2"]
@@ -92,9 +92,9 @@ TABLE_1 = {0: 0.5, 30: 0.75, 60: 0.9330, 90: 1.0, 120: 0.9330, 150: 0.75, 180: 0
 def test_table_1(degrees, expected):
     """From the planner itself, not from the formula."""
     q0 = np.radians([30.0, degrees])
-    problem = PlanProblem(two_link(), q0, 2, sigma=1.0, general_weight=0.0, starts=16, seed=3)
+    problem = PlanProblem(two_link(), q0, 2, noise=1.0, search=Search(general_weight=0.0, starts=16, seed=3))
     found = plan(problem)
-    assert found.predicted_accuracy**2 == pytest.approx(expected, abs=2e-4)
+    assert found.quality.predicted_accuracy**2 == pytest.approx(expected, abs=2e-4)
     d_optimal = np.radians([[0.0, -90.0], [0.0, 90.0]])
     rho_d = variance(two_link(), d_optimal, q0)
     assert rho_d == pytest.approx(1.0, rel=1e-12)
@@ -107,12 +107,12 @@ def test_table_1(degrees, expected):
 @pytest.mark.parametrize("degrees", [10, 50, 100, 170])
 def test_plan_reaches_equation_20_and_never_beats_its_bound(pair, m, degrees):
     q0 = np.radians([-20.0, degrees])
-    problem = PlanProblem(two_link(pair), q0, m, sigma=1.0, general_weight=0.0, starts=16, seed=1)
+    problem = PlanProblem(two_link(pair), q0, m, noise=1.0, search=Search(general_weight=0.0, starts=16, seed=1))
     found = plan(problem)
     best = np.sqrt(equation_20(m, q0[1]))
-    assert found.predicted_accuracy == pytest.approx(best, rel=1e-4)
-    assert found.lower_bound <= best * (1 + 1e-6)
-    assert found.efficiency > 0.995
+    assert found.quality.predicted_accuracy == pytest.approx(best, rel=1e-4)
+    assert found.quality.lower_bound <= best * (1 + 1e-6)
+    assert found.quality.efficiency > 0.995
 
 
 FIGURES = {

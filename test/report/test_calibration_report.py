@@ -161,12 +161,12 @@ def test_what_was_rejected_is_listed_with_its_reason() -> None:
     )
 
 
-def test_held_parameters_and_correlated_pairs_are_named() -> None:
+def test_fixed_parameters_and_correlated_pairs_are_named() -> None:
     problem, estimate = kuka(12, unknown=("base",), share=0.1)
     assert estimate.held and estimate.correlations
     text = " ".join(Page(report_page(calibration_report(problem, estimate))).text["parameters"].split())
     for name, combination in zip(estimate.held, estimate.unidentifiable, strict=True):
-        assert f"{name} " in text and f"cannot be seen: {combination}" in text
+        assert f"{name} " in text and f"the data cannot show it: {combination}" in text
     for a, b, _ in estimate.correlations:
         assert f"{a}, {b}" in text
 

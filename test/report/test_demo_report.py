@@ -13,17 +13,18 @@ from rich.console import Console
 from calib_planner import IdentificationProblem, PlanProblem, Robot, identify, plan
 from calib_planner.demo import DemoResult, demo_report, draw, print_table
 from calib_planner.errors import InputError
+from calib_planner.planning import Search
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 
 @pytest.fixture(scope="module")
 def result() -> DemoResult:
     robot = Robot.load("planar_2r").with_parameters("lengths+offsets")
-    problem = PlanProblem(robot, [0.3, 0.5], 4, starts=4)
+    problem = PlanProblem(robot, [0.3, 0.5], 4, search=Search(starts=4))
     made = plan(problem)
     truth = random_deviations(robot, 2)
-    data = SimulatedCell(robot, truth, problem.sigma).measure(made.configurations, 1, 2)
-    estimate = identify(IdentificationProblem(robot, data, sigma=problem.sigma))
+    data = SimulatedCell(robot, truth, problem.instrument.typical).measure(made.configurations, 1, 2)
+    estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
     with pytest.raises(InputError, match="estimate"):
         demo_report(PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6), made, estimate, truth)
     return demo_report(problem, made, estimate, truth, report="here")

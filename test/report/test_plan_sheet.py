@@ -8,13 +8,14 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from robots import mixed, plan_of, random_configurations
+from robots import changed, mixed, plan_of, random_configurations
 from scipy.spatial.transform import Rotation
 
 from calib_planner import Robot
 from calib_planner.planning import ReflectorAcceptance, TrackerRange, plan_sheet
 from calib_planner.planning.constraints import Custom
 from calib_planner.report.plan_sheet import BOXES, posture_drawings, sheet_page
+from calib_planner.report.render import svg
 from calib_planner.tracker import LaserTracker
 from calib_planner.units import duration, length, signed
 
@@ -61,20 +62,20 @@ def kuka_sheet(*args, **options):
 
 
 @pytest.mark.parametrize("make", [lambda: Robot.load("kuka_kr270"), mixed], ids=["kuka", "mixed"])
-def test_every_stop_has_its_numbers_and_boxes(make):
+def test_every_visit_has_its_numbers_and_boxes(make):
     robot = make()
     sheet = plan_sheet(plan_of(robot, random_configurations(robot, 6, 2), 3), robot)
     page = Page(sheet_page(sheet))
-    assert [k for k in page.rows if k != "head"] == [f"stop{i}" for i in range(1, 7)]
+    assert [k for k in page.rows if k != "head"] == [f"visit{i}" for i in range(1, 7)]
     for i, q in enumerate(sheet.plan.configurations):
-        text = page.rows[f"stop{i + 1}"]
+        text = page.rows[f"visit{i + 1}"]
         for name, turns, value in zip(robot.joint_names, robot.joint_is_revolute, q, strict=True):
             big = f"{np.degrees(value):.3f}°" if turns else f"{1e3 * value:.3f} mm"
             assert name in text and big.replace("-", "−") in text and f"{value:.6f}".replace("-", "−") in text
         way = np.degrees(np.abs(sheet.timetable.travel[i][robot.joint_is_revolute]))
         assert (f"max {way.max():.1f}°" in text and f"sum {way.sum():.1f}°" in text) if i else "not" in text
     ticks = [v for tag, name, v in page.attributes if tag == "input" and name == "aria-label"]
-    assert len(ticks) == 18 and ticks[3] == "stop 2, measurement 1"
+    assert len(ticks) == 18 and ticks[3] == "visit 2, measurement 1"
     for promise in ("20 µm", "15 µm", "75.0 %", "18", sheet.identity, "reduced speed"):
         assert promise in sheet_page(sheet)
 
@@ -89,8 +90,8 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_nothing_is_claimed_that_was_not_checked():
     rows = Page(sheet_page(kuka_sheet())).rows
-    assert all("not checked" in rows[f"stop{i}"] and "range" not in rows[f"stop{i}"] for i in range(1, 6))
-    known = Page(sheet_page(kuka_sheet((), LaserTracker(station=STATION)))).rows["stop1"]
+    assert all("not checked" in rows[f"visit{i}"] and "range" not in rows[f"visit{i}"] for i in range(1, 6))
+    known = Page(sheet_page(kuka_sheet((), LaserTracker(station=STATION)))).rows["visit1"]
     assert "not checked" in known and "range" in known and "elevation" in known and "incidence" not in known
     text = sheet_page(kuka_sheet())
     assert re.search(r"Not checked:</strong> tracker range, .*line of sight, self-collision, other objects", text)
@@ -104,11 +105,11 @@ def test_what_is_wrong_is_said_with_its_reason():
     page = Page(text)
     assert "<b>room</b>" not in text and "no &lt;b&gt;room&lt;/b&gt;" in text
     for i, (reach, q) in enumerate(zip(sheet.checks.reachable, sheet.plan.configurations, strict=True), 1):
-        row = page.rows[f"stop{i}"]
+        row = page.rows[f"visit{i}"]
         assert reach == (q[0] > sheet.plan.configurations[2, 0])
         assert ("no <b>room</b>" in row) != reach and "tracker range" in row and "incidence" in row
-    assert "Not visible: stops 1, 2, 3, 4, 5." in text and "Not reachable: stop" in text
-    other = replace(sheet, plan=replace(sheet.plan, robot="<another>", status="singular", message="Beware."))
+    assert "Not visible: visits 1, 2, 3, 4, 5." in text and "Not reachable: visit" in text
+    other = replace(sheet, plan=changed(sheet.plan, robot="<another>", status="singular", message="Beware."))
     assert "made for &lt;another&gt;" in sheet_page(other) and "singular: Beware." in sheet_page(other)
 
 
@@ -127,6 +128,10 @@ def test_criteria_without_a_bound_have_none_on_the_page():
     assert "this criterion has none" in text and "nan" not in text and "ρ0" not in text
 
 
+def drawings(*args):
+    return list(map(svg, posture_drawings(*args)))
+
+
 def arms(drawing: str) -> list[np.ndarray]:
     """(points, 2) of every view's polyline, y upwards."""
     found = re.findall(r'class="arm" points="([^"]*)"', drawing)
@@ -136,7 +141,7 @@ def arms(drawing: str) -> list[np.ndarray]:
 def test_the_drawing_of_a_planar_arm_is_the_arm():
     robot = Robot.load("planar_2r")
     q = random_configurations(robot, 8, 3)
-    for (q1, q2), drawing in zip(q, posture_drawings(robot, q), strict=True):
+    for (q1, q2), drawing in zip(q, drawings(robot, q), strict=True):
         (arm,) = arms(drawing)  # from above only
         base, elbow, tip = arm[0], arm[-2], arm[-1]
         upper, fore = complex(*(elbow - base)), complex(*(tip - elbow))
@@ -150,7 +155,7 @@ def test_the_side_view_shows_the_height_and_the_reach_of_the_tip():
     q = random_configurations(robot, 12, 4)
     tips = robot.positions(q)[:, 0]
     scale = None
-    for tip, drawing in zip(tips, posture_drawings(robot, q), strict=True):
+    for tip, drawing in zip(tips, drawings(robot, q), strict=True):
         side, top = arms(drawing)
         out, up = side[-1] - side[0]
         x, y = top[-1] - top[0]
@@ -167,7 +172,7 @@ def test_drawings_are_in_the_axes_of_the_base():
     placed = robot.with_base(Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix(), [0.5, -1.0, 0.3])
     q = random_configurations(robot, 4, 5)
     moved = placed.base_pose[0] @ STATION + placed.base_pose[1]
-    pairs = zip(posture_drawings(robot, q, STATION), posture_drawings(placed, q, moved), strict=True)
+    pairs = zip(drawings(robot, q, STATION), drawings(placed, q, moved), strict=True)
     for here, there in pairs:
         assert here.count("beam") == 1
         a, b = (np.array([float(w) for w in re.findall(r"-?\d+\.\d", d)]) for d in (here, there))

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import NANO
 from calib_planner.io.store import FILE
+from calib_planner.planning import Search
 from calib_planner.ros.messages import plan_to_message, point_message, stamp_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.qos import EVENTS, LATCHED
@@ -32,7 +33,7 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="module")
 def planned(robot: Robot) -> Plan:
-    return plan(PlanProblem(robot, [0.3, 0.5], 4, starts=4, sigma=3e-5 / 20**0.5))
+    return plan(PlanProblem(robot, [0.3, 0.5], 4, noise=3e-5 / 20**0.5, search=Search(starts=4)))
 
 
 @pytest.fixture

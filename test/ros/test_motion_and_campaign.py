@@ -12,6 +12,7 @@ from calib_planner import Estimate, Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import Standstill, StandstillDetector
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.io import CampaignStore, StoredModel, open_store
+from calib_planner.planning import Search
 from calib_planner.ros import session as saving
 from calib_planner.ros.session import Campaign, Matching, TooFew
 from calib_planner.simulation import SimulatedCell, make_tour, random_deviations
@@ -47,7 +48,7 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="module")
 def planned(robot: Robot) -> Plan:
-    return plan(PlanProblem(robot, [0.3, 0.5], 4, starts=4))
+    return plan(PlanProblem(robot, [0.3, 0.5], 4, search=Search(starts=4)))
 
 
 @pytest.fixture

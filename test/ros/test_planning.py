@@ -15,6 +15,7 @@ from robots import random_configurations
 
 from calib_planner import PlanProblem, Robot, plan
 from calib_planner.errors import InputError
+from calib_planner.planning import Search
 from calib_planner.ros.model import NotReady, described_model, shipped_model
 from calib_planner.ros.planning import answer
 from calib_planner.ros.settings import PlannerParameters
@@ -107,10 +108,10 @@ def test_cancelling_returns_the_best_so_far() -> None:
 def test_it_is_the_library_s_plan() -> None:
     request = PlanCalibration.Request(test_poses=POSE, seed=9)
     found = answer(request, SETTINGS, OWN)
-    wanted = plan(PlanProblem(OWN.robot, [POSE], 4, sigma=SETTINGS.sigma, starts=4, seed=9))
+    wanted = plan(PlanProblem(OWN.robot, [POSE], 4, noise=SETTINGS.sigma, search=Search(starts=4, seed=9)))
     assert found.plan is not None
     np.testing.assert_array_equal(found.plan.configurations, wanted.configurations)
-    assert found.plan.predicted_accuracy == wanted.predicted_accuracy
+    assert found.plan.quality.predicted_accuracy == wanted.quality.predicted_accuracy
 
 
 def test_candidates_are_chosen_among() -> None:

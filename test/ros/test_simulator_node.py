@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState
 
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import NANO
+from calib_planner.planning import Search
 from calib_planner.ros.messages import nanoseconds, plan_to_message
 from calib_planner.ros.nodes import simulator as simulator_node
 from calib_planner.ros.nodes.simulator import SimulatorNode
@@ -31,7 +32,7 @@ Result = ExecutePlan.Result
 @pytest.fixture(scope="module")
 def planned() -> Plan:
     robot = Robot.load("planar_2r").with_parameters("lengths+offsets")
-    return plan(PlanProblem(robot, [0.3, 0.5], 3, starts=2))
+    return plan(PlanProblem(robot, [0.3, 0.5], 3, search=Search(starts=2)))
 
 
 def goal_of(planned: Plan, **changes: Any) -> ExecutePlan.Goal:

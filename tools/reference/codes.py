@@ -19,7 +19,7 @@ from calib_planner.compensation import STATUS as COMPENSATION
 from calib_planner.identification import verdict
 from calib_planner.identification.estimate import STATUS as ESTIMATE
 from calib_planner.planning.certify.prove import PROOF_STATUS
-from calib_planner.planning.plan import STATUS as PLAN
+from calib_planner.planning.result import STATUS as PLAN
 
 INTRODUCTION = """\
 Programs should look at these words; the messages beside them are for people. Those of ROS 2 interfaces are

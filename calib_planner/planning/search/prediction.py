@@ -66,7 +66,7 @@ def prediction_problem(problem: PlanProblem, pool: FloatArray) -> PredictionProb
     assert problem.discrepancy is not None
     robot = problem.robot
     std = problem.discrepancy.prior_std(robot)
-    for name, value in problem.prior_std.items():
+    for name, value in problem.prior.std.items():
         std[robot.parameter_names.index(name)] = value
     nothing = np.empty((0, len(robot.joint_names)))
     return PredictionProblem(
@@ -79,8 +79,8 @@ def prediction_problem(problem: PlanProblem, pool: FloatArray) -> PredictionProb
         noise=problem.instrument,
         repetitions=problem.repetitions,
         prior_std=std,
-        measured=nothing if problem.measured is None else problem.measured.q,
-        repeat=problem.repeat_candidates,
+        measured=nothing if problem.prior.measured is None else problem.prior.measured.q,
+        repeat=not problem.once_each,
     )
 
 

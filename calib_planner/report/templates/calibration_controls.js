@@ -9,12 +9,12 @@
 
   // ── screen, paper ─────────────────────────────────────────────────────────────────────────────────
 
-  let asked = false;
+  let waiting = false;
   function redraw() {
-    if (asked) return;
-    asked = true;
+    if (waiting) return;
+    waiting = true;
     requestAnimationFrame(() => {
-      asked = false;
+      waiting = false;
       const ratio = Math.min(window.devicePixelRatio || 1, 3), box = canvas.getBoundingClientRect();
       if (!box.width) return;
       canvas.width = Math.round(box.width * ratio);

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, check_count
+from calib_planner.arrays import FloatArray, check_count, plain
 from calib_planner.errors import InputError
 from calib_planner.planning.information import PlanSpace, plan_space
-from calib_planner.planning.plan import Plan, plain
 from calib_planner.planning.planner import plan
 from calib_planner.planning.problem import PlanProblem
+from calib_planner.planning.result import Plan
 
 BATCH = 20_000
 """Configurations evaluated at once."""
@@ -39,9 +39,9 @@ class Comparison:
                 "label": self.label,
                 "configurations": len(self.proposed.configurations),
                 "repetitions": int(self.proposed.repetitions[0]),
-                "proposed": self.proposed.predicted_accuracy,
-                "lower_bound": self.proposed.lower_bound,
-                "efficiency": self.proposed.efficiency,
+                "proposed": self.proposed.quality.predicted_accuracy,
+                "lower_bound": self.proposed.quality.lower_bound,
+                "efficiency": self.proposed.quality.efficiency,
                 "random": {
                     "count": len(self.random),
                     "max": self.random.max(),
@@ -66,7 +66,7 @@ def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> l
     columns = []
     for k, r in sizes:
         asked = replace(problem, configurations=k, repetitions=r)
-        random = random_accuracies(plan_space(asked), count, np.random.default_rng([problem.seed, k, r]))
+        random = random_accuracies(plan_space(asked), count, np.random.default_rng([problem.search.seed, k, r]))
         columns.append(Comparison(str(k) if r == 1 else f"{k}x{r}", plan(asked), random))
     return columns
 
