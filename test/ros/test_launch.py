@@ -57,7 +57,7 @@ def test_it_compiles_and_names_what_exists(path: Path) -> None:
         if re.fullmatch(r"\w+\.yaml", text):
             assert (config_folder() / text).is_file()
         if re.fullmatch(r"\w+_node", text):
-            assert importlib.util.find_spec(f"calib_planner.ros.{text}")
+            assert importlib.util.find_spec(f"calib_planner.ros.nodes.{text.removesuffix('_node')}")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)
