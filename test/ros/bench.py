@@ -32,6 +32,34 @@ def overrides(values: Mapping[str, Any]) -> list[Parameter]:
     return [Parameter(k, value=v) for k, v in values.items()]
 
 
+class Client(ActionClient):
+    """As rclpy's, used by one thread and spun by another: an answer waits until its request is noted.
+
+    Else it is thrown away when it comes at once, and its future never ends: https://github.com/ros2/rclpy/issues/1123,
+    mended by pull request 1308, which the wheels do not have.
+    """
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        self._turn = threading.RLock()
+        super().__init__(*args, **named)
+
+    def send_goal_async(self, *args: Any, **named: Any) -> Any:
+        with self._turn:
+            return super().send_goal_async(*args, **named)
+
+    def _get_result_async(self, goal_handle: Any) -> Any:
+        with self._turn:
+            return super()._get_result_async(goal_handle)
+
+    def _cancel_goal_async(self, goal_handle: Any) -> Any:
+        with self._turn:
+            return super()._cancel_goal_async(goal_handle)
+
+    async def execute(self, taken_data: Any) -> None:
+        with self._turn:
+            await super().execute(taken_data)
+
+
 class Bench:
     def __init__(self) -> None:
         self._kept = ExitStack()
@@ -73,9 +101,11 @@ class Bench:
         self.stopping = True
         for executor, thread in self._spinning:
             executor.wake()
-            thread.join(timeout=10.0)
+            thread.join(timeout=60.0)
         for executor, _ in self._spinning:
             executor.shutdown()
+            if isinstance(executor, MultiThreadedExecutor):
+                executor._executor.shutdown()  # rclpy leaves its threads at work on what is destroyed next
         for client in self.actions:
             client.destroy()
         # Without this the DDS participant lives on: beyond some 30 of them discovery fails.
@@ -90,16 +120,17 @@ class Bench:
         self.nodes.append(node)
         self._spin(node, getattr(kind, "THREADS", 1))
         if isinstance(node, ManagedNode) and node.settings.value.autostart:
-            self.wait(lambda: node.autostarted, 30.0)
+            self.wait(lambda: node.autostarted)
         return node
 
-    def wait(self, condition: Callable[[], Any], seconds: float = 15.0) -> None:
+    def wait(self, condition: Callable[[], Any], seconds: float = 60.0) -> None:
+        """Until ``condition``; ``seconds`` are what a busy machine may take, not what is expected."""
         deadline = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < deadline, f"not within {seconds} s"
             time.sleep(0.005)
 
-    def future(self, future: Any, seconds: float = 15.0) -> Any:
+    def future(self, future: Any, seconds: float = 60.0) -> Any:
         self.wait(future.done, seconds)
         return future.result()
 
@@ -131,7 +162,7 @@ class Bench:
         """The client of an action, one for all: a new one may be answered before discovery has matched it."""
         client = self._action_clients.get(name)
         if client is None:
-            client = self._action_clients[name] = ActionClient(self.client, kind, name)
+            client = self._action_clients[name] = Client(self.client, kind, name)
             self.actions.append(client)
         self.wait(client.server_is_ready)
         return client
@@ -141,7 +172,7 @@ class Bench:
         for _ in range(3):
             sent = client.send_goal_async(goal, **options)
             try:
-                handle = self.future(sent, 5.0)
+                handle = self.future(sent, 20.0)
             except AssertionError:
                 continue
             assert handle.accepted

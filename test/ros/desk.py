@@ -34,14 +34,21 @@ class Desk:
         if not elsewhere:
             self.node = bench.start(CampaignNode, **(ASKED | parameters))
             bench.wait(lambda: self.heard)
-            for name in ("pause", "resume", "skip"):  # refused: nothing was begun; discovery is through then
-                assert not self.call(name)[0]
+            self.meet()
+
+    def meet(self) -> None:
+        """Have a node without a campaign refuse what can be asked twice.
+
+        Discovery is through then: ``start``, which cannot, is answered at its first call.
+        """
+        for name in ("pause", "resume", "skip"):
+            assert not self.call(name)[0]
 
     def call(self, name: str) -> tuple[bool, str]:
         """A first call may be answered before discovery has matched its reader: then it is repeated."""
         client = self.clients[name]
         self.bench.wait(client.service_is_ready)
-        for _ in range(3):
+        for _ in range(6):
             future = client.call_async(Trigger.Request())
             try:
                 response = self.bench.future(future, 5.0)
@@ -55,15 +62,17 @@ class Desk:
     def now(self) -> CampaignStatus:
         return self.heard[-1]
 
-    def until(self, state: int, seconds: float = 30.0, **fields: Any) -> CampaignStatus:
-        """The first status from now on in that state with these fields, or with at least these counts."""
+    def until(self, state: int, seconds: float = 60.0, said: str = "", **counts: int) -> CampaignStatus:
+        """The first status from the newest one on in that state, with these words and at least these counts."""
+        begin, found = len(self.heard) - 1, list[CampaignStatus]()
 
         def there() -> bool:
-            m = self.now
-            return m.state == state and all(getattr(m, k) >= v for k, v in fields.items())
+            enough = (m for m in self.heard[begin:] if all(getattr(m, k) >= v for k, v in counts.items()))
+            found.extend(m for m in enough if m.state == state and said in m.reason)
+            return bool(found)
 
         try:
             self.bench.wait(there, seconds)
         except AssertionError:
-            raise AssertionError(f"not in state {state} within {seconds} s: {self.now}") from None
-        return self.now
+            raise AssertionError(f"not in state {state} within {seconds} s: {said} {self.now}") from None
+        return found[0]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
-import subprocess
-import sys
-import textwrap
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 import pytest
@@ -245,22 +248,33 @@ def test_a_store_that_cannot_be_opened_stops_acceptance_only() -> None:
 
 # ── kill -9 ──────────────────────────────────────────────────────────────────────────────────────────
 
-CAMPAIGN = """
-    import sys
-    from test_campaign_goes_on import *
-    campaign = begun(opened(sys.argv[1]))
-    campaign.estimate(HOW); campaign.judge()
-    print("open", *sorted(d.number for d in campaign.kept), flush=True)
+SERVER = multiprocessing.get_context("forkserver")
+"""Processes of its own that have all modules from the beginning: to import them takes longer than a campaign."""
+SERVER.set_forkserver_preload(["calib_planner.ros.session", "calib_planner.simulation", "pytest"])
+
+
+def campaign_to_its_end(folder: Path, out: Connection) -> None:
+    """What the process does: measure what is still to be done, say what was decided, and wait to be killed."""
+
+    def say(*words: object) -> None:
+        os.write(out.fileno(), f"{' '.join(map(str, words))}\n".encode())
+
+    campaign = begun(opened(folder))
+    campaign.estimate(HOW)
+    campaign.judge()
+    say("open", *sorted(d.number for d in campaign.kept))
     for attempt, row in schedule(campaign):
         if attempt == "undo":
-            print("undone", campaign.undo(row).number, flush=True)
-            campaign.estimate(HOW); campaign.judge()
+            undone = campaign.undo(row)
+            assert undone is not None
+            say("undone", undone.number)
+            campaign.estimate(HOW)
+            campaign.judge()
             continue
         for word in measure(campaign, seen(row, 2e-3 if row == 5 and attempt == 0 else 0.0, attempt)):
-            print(word, campaign.kept[-1].number, flush=True)
-    print("complete", flush=True)
-    sys.stdin.read()
-"""
+            say(word, campaign.kept[-1].number)
+    say("complete")
+    time.sleep(600.0)
 
 
 def schedule(campaign: Campaign) -> list[tuple[object, int]]:
@@ -288,14 +302,19 @@ def everything(campaign: Campaign) -> list[object]:
     return [d for d in found.decisions if isinstance(d.found, Standstill)]
 
 
-def run_campaign(folder: Path) -> subprocess.Popen[str]:
-    here = Path(__file__)
-    paths = [str(here.parent), str(here.parents[1]), str(here.parents[2]), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    return subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(CAMPAIGN), str(folder)], text=True, env=environment, **pipes
-    )  # type: ignore[call-overload]
+@contextmanager
+def run_campaign(folder: Path) -> Iterator[tuple[BaseProcess, TextIO]]:
+    """The process, and what it says line by line; killed at the end, if it was not before."""
+    reader, writer = SERVER.Pipe(duplex=False)
+    process = SERVER.Process(target=campaign_to_its_end, args=(folder, writer), daemon=True)
+    process.start()
+    writer.close()  # the process's own is left, and goes with it
+    with reader, open(reader.fileno(), closefd=False) as lines:
+        try:
+            yield process, lines
+        finally:
+            process.kill()
+            process.join()
 
 
 def final(folder: Path) -> tuple[list[tuple[object, ...]], object]:
@@ -315,11 +334,9 @@ def finish(folder: Path) -> None:
         store.close()
         if not left:
             return
-        with run_campaign(folder) as process:
-            assert process.stdout is not None
-            while "complete" not in process.stdout.readline():
-                assert process.poll() is None
-            process.kill()
+        with run_campaign(folder) as (process, lines):
+            while "complete" not in lines.readline():
+                assert process.is_alive()
     raise AssertionError("not finished")
 
 
@@ -330,15 +347,14 @@ def test_kill_9_at_any_moment_costs_nothing_that_was_told(tmp_path: Path) -> Non
     rng, folder = random.Random(3), tmp_path / "killed"
     told: set[int] = set()
     for _ in range(10):
-        with run_campaign(folder) as process:
-            assert process.stdout is not None
-            first = process.stdout.readline().split()
+        with run_campaign(folder) as (process, lines):
+            first = lines.readline().split()
             assert told <= {int(n) for n in first[1:]}, "told and lost"
             told = {int(n) for n in first[1:]}
             for _ in range(rng.randrange(4)):
-                note(process.stdout.readline(), told)
+                note(lines.readline(), told)
             process.kill()
-            for line in process.stdout:
+            for line in lines:
                 note(line, told)
     finish(folder)
     found, again = final(folder)

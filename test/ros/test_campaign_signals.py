@@ -62,6 +62,7 @@ def test_told_to_end_the_robot_stops_and_a_restart_goes_on(
     cell.answer = lambda q: "hang" if len(cell.visited) == 5 else "ok"
     desk = Desk(bench, elsewhere=True)
     runs.start()
+    desk.meet()
     assert desk.call("start")[0]
     told = desk.until(S.MEASURING, 60.0, measured=4)
     bench.wait(lambda: len(cell.visited) == 5)

@@ -10,6 +10,7 @@ from desk import Desk, S
 from fake_cell import FakeCell
 
 from calib_planner.ros import campaign as campaign_measuring
+from calib_planner.ros.nodes import campaign as campaign_node
 
 CLOCK = Measurement.REJECTED_CLOCK_OFFSET
 
@@ -17,6 +18,7 @@ CLOCK = Measurement.REJECTED_CLOCK_OFFSET
 @pytest.fixture
 def cell(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> FakeCell:
     monkeypatch.setattr(campaign_measuring, "RETRY", 0.2)
+    monkeypatch.setattr(campaign_node, "PERIOD", 0.01)
     return bench.start(FakeCell)
 
 
@@ -47,8 +49,7 @@ def test_what_would_spoil_any_measurement_is_waited_for(
     spoilt = spoil(cell, status, points)
     desk = Desk(bench, patience=0.2 if not points else 600.0)
     assert desk.call("start")[0]
-    waiting = desk.until(S.WAITING)
-    assert "synchronise the clocks" in waiting.reason and waiting.measured == 3
+    assert desk.until(S.WAITING, said="synchronise the clocks").measured == 3
     count = len(cell.visited)
     bench.wait(lambda: len(cell.visited) > count)  # tried again, at the same place
     np.testing.assert_array_equal(cell.visited[-1], cell.visited[3])

@@ -246,7 +246,7 @@ def test_the_executor_drives_a_controller(
 
     def run(goal: ExecutePlan.Goal) -> Any:
         handle = bench.goal(client, goal, feedback_callback=feedback.append)
-        return bench.future(handle.get_result_async(), 30.0).result
+        return bench.future(handle.get_result_async()).result
 
     goal = ExecutePlan.Goal(plan=plan_to_message(plan_of(ROBOT, Q, 2), "p", 0, "base"))
     result = run(goal)
@@ -283,12 +283,12 @@ def test_the_executor_does_one_plan_at_a_time_and_can_be_stopped(
     second = bench.future(bench.goal(client, goal).get_result_async()).result
     assert second.status == second.BUSY and second.executed == 0
     bench.future(handle.cancel_goal_async())
-    assert bench.future(handle.get_result_async(), 10.0).result.status == second.CANCELLED
+    assert bench.future(handle.get_result_async()).result.status == second.CANCELLED
     controller = executor[0]
     controller.hang = True
     handle = bench.goal(client, goal)
     bench.future(handle.cancel_goal_async())  # while it moves
-    assert bench.future(handle.get_result_async(), 10.0).result.status == second.CANCELLED
+    assert bench.future(handle.get_result_async()).result.status == second.CANCELLED
 
 
 def test_without_control_msgs_the_executor_still_imports_all_else(

@@ -197,7 +197,7 @@ def test_plans(cell: Cell, planned: Plan, case: str) -> None:
     client = cell.bench.action(ExecutePlan, f"{SIMULATOR}/execute_plan")
     if case in ("a long id", "100 000 parameters", "sigma"):  # not what it executes
         goal.plan.robot = "other"
-    result = cell.bench.future(cell.bench.goal(client, goal).get_result_async(), 30.0).result
+    result = cell.bench.future(cell.bench.goal(client, goal).get_result_async()).result
     assert result.status == ExecutePlan.Result.INVALID_PLAN and 0 < len(result.message) < 3000
     cell.check()
 
@@ -235,7 +235,7 @@ def test_requests(cell: Cell, case: str) -> None:
     assert answer.field and 0 < len(answer.message) < 3000
     client = cell.bench.action(PlanCalibration, f"{PLANNER}/plan")
     goal = PlanCalibration.Goal(**({"test_poses": POSE, "configurations": 3} | REQUESTS[case]))
-    result = cell.bench.future(cell.bench.goal(client, goal).get_result_async(), 30.0).result
+    result = cell.bench.future(cell.bench.goal(client, goal).get_result_async()).result
     assert (result.status, result.field) == (answer.status, answer.field)
     cell.check()
 
@@ -342,9 +342,9 @@ def test_a_plan_is_measured_and_saved_whatever_its_name(cell: Cell, planned: Pla
     cell.bench.wait(lambda: cell.estimates[-1].plan_id == plan_id)
     client, known = cell.bench.action(ExecutePlan, f"{SIMULATOR}/execute_plan"), len(cell.measurements)
     goal = cell.bench.goal(client, ExecutePlan.Goal(plan=message))
-    assert cell.bench.future(goal.get_result_async(), 60.0).result.status == ExecutePlan.Result.SUCCESS
+    assert cell.bench.future(goal.get_result_async()).result.status == ExecutePlan.Result.SUCCESS
     accepted = lambda: [m for m in cell.measurements[known:] if m.status == Measurement.ACCEPTED]  # noqa: E731
-    cell.bench.wait(lambda: len(accepted()) >= 4, 20.0)
+    cell.bench.wait(lambda: len(accepted()) >= 4)
     for name in ("save", "report"):
         answer = cell.bench.call(Trigger, f"{IDENTIFIER}/{name}", Trigger.Request(), 60.0)
         assert answer.success, answer.message

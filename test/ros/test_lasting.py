@@ -36,13 +36,13 @@ class Slow(ManagedNode[LifecycleParameters]):
 
     def _ask(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.begun.release()
-        self.go.wait(20.0)
+        self.go.wait(60.0)
         response.message = "done"
         return response
 
     def _do(self, goal: Any) -> Result:
         self.begun.release()
-        self.go.wait(20.0)
+        self.go.wait(60.0)
         if goal.is_active:
             goal.succeed()
         return Result(status=Result.ABORTED, message="done")
@@ -94,7 +94,7 @@ def test_what_a_service_was_asked_is_answered(bench: Bench) -> None:
     service = bench.client.create_client(Trigger, "slow/ask")
     bench.wait(service.service_is_ready)
     asked = service.call_async(Trigger.Request())
-    assert node.begun.acquire(timeout=10.0)
+    assert node.begun.acquire(timeout=60.0)
     change(bench, *DOWN)
     assert not asked.done()
     node.go.set()
@@ -106,7 +106,7 @@ def test_a_goal_under_way_gets_its_result(bench: Bench) -> None:
     node = bench.start(Slow)
     action = bench.action(ExecutePlan, "slow/do")
     result = bench.goal(action, ExecutePlan.Goal()).get_result_async()
-    assert node.begun.acquire(timeout=10.0)
+    assert node.begun.acquire(timeout=60.0)
     # Whoever asks for the result when the server is gone asks nobody.
     bench.wait(lambda: any(f._callbacks for f in node.server._result_futures.values()))
     change(bench, *DOWN)

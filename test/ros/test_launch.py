@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -52,6 +53,11 @@ def test_it_compiles_and_names_what_exists(path: Path) -> None:
     assert ast.get_docstring(tree)
     texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
     assert NAMES & set(texts)
+    for text in texts:
+        if re.fullmatch(r"\w+\.yaml", text):
+            assert (config_folder() / text).is_file()
+        if re.fullmatch(r"\w+_node", text):
+            assert importlib.util.find_spec(f"calib_planner.ros.nodes.{text.removesuffix('_node')}")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)

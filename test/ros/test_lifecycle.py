@@ -214,6 +214,13 @@ def test_a_bad_override_is_no_crash(bench: Bench, policy: str, value: Any) -> No
     assert node.state == "unconfigured" and (policy in node.failure or str(value) in node.failure)
 
 
+def test_a_destroyed_node_can_be_asked_for_its_state() -> None:
+    with Bench() as bench:
+        node = bench.start(Small)
+        assert node.is_active
+    assert node.state == "finalized" and not node.is_active
+
+
 def test_closing_ends_everything_once(bench: Bench) -> None:
     node = bench.start(Small)
     assert node.close() and node.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -11,13 +10,12 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
-from bench import Bench
+from bench import Bench, Client
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import GetParameters
-from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from test_planning import urdf
@@ -103,13 +101,13 @@ def test_while_it_plans_it_answers_and_can_be_cancelled(bench: Bench) -> None:
     bench.wait(lambda: feedback)
     busy = bench.call(PlanCalibration, SERVICE, request())
     assert busy.status == Response.BUSY and "again later" in busy.message
-    began = time.monotonic()
+    planned = handle.get_result_async()
     name = "calibration_planner/get_parameters"
     assert bench.call(GetParameters, name, GetParameters.Request(names=["sigma"])).values
-    assert time.monotonic() - began < 5.0  # how fast it is, the benchmark says
+    assert not planned.done()  # how fast it is, the benchmark says
     cancelled = bench.future(handle.cancel_goal_async())
     assert len(cancelled.goals_canceling) == 1
-    result = bench.future(handle.get_result_async(), 60.0)
+    result = bench.future(planned)
     assert result.status == GoalStatus.STATUS_CANCELED
     assert result.result.status == PlanAction.Result.CANCELLED
     assert len(result.result.plan.configurations) == 120
@@ -122,7 +120,7 @@ def test_every_one_of_a_burst_is_answered(bench: Bench) -> None:
     """Forty at once, goals and calls, and all goals cancelled in one go."""
     bench.start(PlannerNode, robot="planar_2r", starts=20_000)
     kinds = ("goal", "result", "cancel")
-    client = ActionClient(bench.client, PlanAction, ACTION, **{f"{k}_service_qos_profile": EVENTS for k in kinds})
+    client = Client(bench.client, PlanAction, ACTION, **{f"{k}_service_qos_profile": EVENTS for k in kinds})
     bench.actions.append(client)
     caller = bench.client.create_client(PlanCalibration, SERVICE, qos_profile=EVENTS)
     canceller = bench.client.create_client(CancelGoal, f"{ACTION}/_action/cancel_goal")
@@ -150,7 +148,7 @@ def test_inactive_it_says_so_and_activated_it_plans(bench: Bench) -> None:
     answer = bench.call(PlanCalibration, SERVICE, request())
     assert answer.status == Response.NOT_READY and "inactive" in answer.message
     handle = bench.goal(bench.action(PlanAction, ACTION), PlanAction.Goal(test_poses=POSE))
-    result = bench.future(handle.get_result_async(), 20.0)
+    result = bench.future(handle.get_result_async())
     assert result.status == GoalStatus.STATUS_ABORTED and result.result.status == PlanAction.Result.NOT_READY
     assert change(bench, Transition.TRANSITION_ACTIVATE)
     assert bench.call(PlanCalibration, SERVICE, request()).status == Response.SUCCESS
@@ -168,7 +166,7 @@ def test_deactivating_ends_the_search(bench: Bench) -> None:
     handle = bench.goal(bench.action(PlanAction, ACTION), long_goal(), feedback_callback=feedback.append)
     bench.wait(lambda: feedback)
     assert change(bench, Transition.TRANSITION_DEACTIVATE)
-    result = bench.future(handle.get_result_async(), 20.0).result
+    result = bench.future(handle.get_result_async()).result
     assert result.status == PlanAction.Result.CANCELLED and len(result.plan.configurations) == 120
 
 
@@ -239,7 +237,7 @@ def test_a_description_can_be_ignored(bench: Bench) -> None:
 def test_the_action_answers_like_the_service(bench: Bench, pose: list[float], status: str) -> None:
     bench.start(PlannerNode, robot="planar_2r", starts=4)
     handle = bench.goal(bench.action(PlanAction, ACTION), PlanAction.Goal(test_poses=pose))
-    result = bench.future(handle.get_result_async(), 20.0)
+    result = bench.future(handle.get_result_async())
     good = status == "SUCCESS"
     assert result.status == (GoalStatus.STATUS_SUCCEEDED if good else GoalStatus.STATUS_ABORTED)
     assert result.result.status == getattr(PlanAction.Result, status)

@@ -33,8 +33,8 @@ def profiles() -> dict[str, Profile]:
 
 
 def test_every_node_has_a_profile(profiles: dict[str, Profile]) -> None:
-    modules = Path(SimulatorNode.__init__.__code__.co_filename).parent.glob("*_node.py")
-    assert sorted(profiles) == sorted(f"/calib_planner/{p.stem.removesuffix('_node')}" for p in modules)
+    modules = Path(SimulatorNode.__init__.__code__.co_filename).parent.glob("[a-z]*.py")
+    assert sorted(profiles) == sorted(f"/calib_planner/{p.stem}" for p in modules)
     assert len({p.node for p in profiles.values()}) == len(profiles)
 
 

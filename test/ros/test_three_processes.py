@@ -28,7 +28,7 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 16})
         nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
-        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7})
+        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 50.0, "dwell": 0.7})
         client = DemoClient(domain, nodes.check)
         try:
             request = PlanCalibration.Request(
@@ -40,8 +40,8 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
                 seed=SEED,
             )
             plan = client.request_plan(request)
-            client.wait(lambda: client.identifier_has(plan.plan_id), 20.0, "estimate")
-            client.execute(plan, 60.0)
+            client.wait(lambda: client.identifier_has(plan.plan_id), 60.0, "estimate")
+            client.execute(plan, 120.0)
             final = client.estimate
             assert final is not None
             assert client.save().startswith("saved ")
@@ -66,7 +66,7 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
         nodes.start("planner_node", {"starts": 5000})
         client = DemoClient(domain, nodes.check)
         try:
-            client.wait(client._plan.service_is_ready, 20.0, "service")
+            client.wait(client._plan.service_is_ready, 60.0, "service")
             pose = [0.0, -1.0, 1.5, 0.0, 0.8, 0.0]
             long = PlanCalibration.Request(test_poses=pose, configurations=150, parameters=["full"])
             busy = PlanCalibration.Request(test_poses=pose, configurations=3)
@@ -77,7 +77,7 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
                 client.wait(future.done, 3.0)
                 return future.done() and future.result().status == PlanCalibration.Response.BUSY
 
-            client.wait(planning, 20.0, "refusal")
+            client.wait(planning, 60.0, "refusal")
         finally:
             client.close()
         assert nodes.end(number) == {"planner_node": 0}, nodes.logs()
@@ -90,7 +90,7 @@ def test_a_node_that_fails_is_reported(tmp_path: Path) -> None:
         client = DemoClient(domain, nodes.check)
         try:
             with pytest.raises(ProcessFailed, match="planner_node ended with status 1") as caught:
-                client.wait(lambda: False, 20.0)
+                client.wait(lambda: False, 60.0)
         finally:
             client.close()
     assert "did you mean 'robot'" in str(caught.value) and "Traceback" not in str(caught.value)
@@ -124,12 +124,12 @@ def running_with(text: str) -> list[str]:
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
     command = [sys.executable, "-m", "calib_planner.ros.demo", "--output", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo_process:
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + 60.0
         while "ready to identify" not in "".join(p.read_text() for p in tmp_path.glob("log/identifier*")):
             assert time.monotonic() < deadline and demo_process.poll() is None
             time.sleep(0.05)
         demo_process.send_signal(number)
-        out, err = demo_process.communicate(timeout=30.0)
+        out, err = demo_process.communicate(timeout=60.0)
     assert demo_process.returncode == 130
     assert out == "" and "interrupted" in err and "Traceback" not in err
     assert not running_with(str(tmp_path))

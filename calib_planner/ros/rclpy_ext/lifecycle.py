@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.action import ActionClient, ActionServer
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -37,8 +38,15 @@ class TidyLifecycleNode(LifecycleNode):
 
     @property
     def state(self) -> str:
-        """``unconfigured``, ``inactive``, ``active``, ``finalized`` or the name of a transition."""
-        return str(self._state_machine.current_state[1])
+        """``unconfigured``, ``inactive``, ``active``, ``finalized`` or the name of a transition.
+
+        A destroyed node is ``finalized``; a thread that it left behind may ask.
+        """
+        try:
+            with self._state_machine:
+                return str(self._state_machine.current_state[1])
+        except InvalidHandle:
+            return "finalized"
 
     def destroy_node(self) -> None:
         """Destroy the node and what belongs to it."""
