@@ -76,7 +76,7 @@ def test_columns_against_central_differences(make):
         np.testing.assert_allclose(columns[..., at], (moved[0] - moved[1]) / (2 * step), atol=1e-8)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 @pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
 def test_erring_joints_are_learnt(seed, known):
     """Fresh poses: far better than geometry alone, and as far off as predicted."""
