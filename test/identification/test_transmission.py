@@ -140,7 +140,7 @@ def test_measured_ur10():
     folder = SHARED_DATA / "ur10_tracker"
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
     data = read_measurements(folder / "random_poses.csv", robot).data
-    for seed in (0, 1):
+    for seed in (0,):
         rows = np.random.default_rng(seed).choice(len(data), 100, replace=False)
         rest = data.select(np.setdiff1d(np.arange(len(data)), rows))
         problem = IdentificationProblem(robot, data.select(rows))
