@@ -66,7 +66,9 @@ def test_predicted_accuracy_matches_what_happens():
     q = random_configurations(robot, 8, 8)
     squares, predicted = [], []
     for seed in range(200):
-        found = identify(IdentificationProblem(robot, cell.measure(q, 1, seed), sigma=SIGMA, test_poses=pose))
+        found = identify(
+            IdentificationProblem(robot, cell.measure(q, 1, seed), sigma=SIGMA, test_poses=pose, starts=0)
+        )
         squares.append(cell.position_errors(found.calibrated, pose)[0, 0] ** 2)
         predicted.append(found.predicted_accuracy)
     error = 0.5 * np.std(squares) / np.mean(squares) / np.sqrt(len(squares))

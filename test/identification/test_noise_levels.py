@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import numpy as np
 import pytest
 from cells import SIGMA, WrongRobot, bare, placed_cell, plain_cell
@@ -132,7 +134,8 @@ def test_improbable_is_as_rare_as_it_says(repeats):
     if repeats:
         own = rng.chisquare(repeats, draws)
         square = square / (own / repeats) + repeats
-    alarms = sum(improbable(float(c), freedom, repeats) for c in square)
+    # The first improbable one in their order tells how many are, for a hundredth of the work.
+    alarms = draws - bisect_left(sorted(square.tolist()), True, key=lambda c: improbable(c, freedom, repeats))
     assert binom.isf(1 - 1e-4, draws, DOUBT) <= alarms <= binom.isf(1e-4, draws, DOUBT)
     assert not improbable(1e9, 9)
 

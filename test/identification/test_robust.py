@@ -15,10 +15,10 @@ from calib_planner.simulation import SimulatedCell, random_deviations
 
 NOISE = {"known": {"sigma": SIGMA}, "unknown": {}}
 CELLS = {
-    "kuka": (plain_cell, 40, 12),
-    "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, 6),
-    "full base tool": (placed_cell, 50, 4),
-    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, 4),
+    "kuka": (plain_cell, 40, 6),
+    "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, 4),
+    "full base tool": (placed_cell, 50, 2),
+    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, 2),
 }
 
 
