@@ -56,7 +56,7 @@ class DemoSettings:
 
 
 class IdentifiedParameters(Protocol):
-    """What ``demo_report`` needs of an estimate; ``Estimate`` has it.
+    """What ``demo_report`` needs of an estimate; ``Estimate.fit`` has it.
 
     Attributes:
         parameters: P names.
@@ -140,7 +140,7 @@ def run_demo(
     measured = IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE])
     estimate = identify(measured)
     result = demo_report(
-        problem, best, estimate, truth, seed=chance_seed, random_plans=settings.random_plans, report=folder
+        problem, best, estimate.fit, truth, seed=chance_seed, random_plans=settings.random_plans, report=folder
     )
     write_plan(folder / "plan.yaml", best)
     write_measurements(folder / "measurements.csv", data)

@@ -127,11 +127,11 @@ class Work:
 
     def start_values(self, start: Estimate | None) -> FloatArray:
         """(P,) deviations to begin from."""
-        if start is None or start.parameters != self.robot.parameter_names:
+        if start is None or start.fit.parameters != self.robot.parameter_names:
             return np.zeros(len(self.robot.parameter_names))
         nominal = np.array([p.nominal for p in self.robot.parameters])
         warm = np.zeros(len(nominal))
-        warm[list(self.kept)] = (start.values - nominal)[list(self.kept)]
+        warm[list(self.kept)] = (start.fit.values - nominal)[list(self.kept)]
         return warm
 
 

@@ -40,13 +40,14 @@ PARAMETER_KEYS = ("name", "unit", "nominal", "value", "deviation", "std")
 NEEDED = ("robot", "joint_names", "parameters", "covariance", "sigma", "status")
 SERIES = ("scale", "shift", "cosines", "sines")
 PER_POSE = "predicted_accuracy_per_test_pose"
-UNLIMITED = (
-    PER_POSE,
-    "predicted_accuracy",
-    "geometry_accuracy_per_test_pose",
-    "parameter_accuracy_per_test_pose",
-)
-"""Values that can be infinite; JSON has no word for that, YAML has."""
+UNLIMITED = {
+    PER_POSE: "predicted",
+    "predicted_accuracy": "overall",
+    "geometry_accuracy_per_test_pose": "geometry",
+    "parameter_accuracy_per_test_pose": "parameters",
+    "required_accuracy": "required",
+}
+"""Key → field of ``Accuracy`` that can be infinite; JSON has no word for that, YAML has."""
 
 
 def write_estimate(path: str | Path, estimate: Estimate | SavedEstimate, field: str = "output") -> None:
@@ -62,11 +63,8 @@ def write_estimate(path: str | Path, estimate: Estimate | SavedEstimate, field: 
 def document_of(estimate: Estimate) -> dict[str, Any]:
     """What ``write_estimate`` writes, without its format line, as plain values."""
     content = estimate.to_dict()
-    unlimited = {name: getattr(estimate, name) for name in (*UNLIMITED, "required_accuracy")}
-    content |= {
-        k: v for k, v in plain(unlimited, keep_infinite=True).items() if k in content or k not in UNLIMITED
-    }
-    return content | placement(estimate)
+    unlimited = {key: getattr(estimate.accuracy, name) for key, name in UNLIMITED.items() if key in content}
+    return content | plain(unlimited, keep_infinite=True) | placement(estimate)
 
 
 def placement(estimate: Estimate) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def report_page(report: CalibrationReport) -> str:
         advice=advice,
         sets=[(name, f"estimate.{key}") for name, key, _ in charts.validation_sets(report.estimate)],
         parameters=_parameters(report.estimate),
-        placed=any(map(is_nuisance, report.estimate.parameters)),
+        placed=any(map(is_nuisance, report.estimate.fit.parameters)),
         structure=_structure(report.estimate),
         ways=ways_to_apply(report),
         counts={
@@ -128,10 +128,10 @@ def rounded(value: float, style: str) -> str:
 def _parameters(e: Estimate) -> list[dict[str, Any]]:
     """Index, name, unit and remarks of each parameter."""
     partners: dict[str, list[str]] = {}
-    for a, b, c in e.correlations:
+    for a, b, c in e.fit.correlations:
         for one, other in ((a, b), (b, a)):
             partners.setdefault(one, []).append(f"{other} ({signed(c, 2)})")
-    fixed = dict(zip(e.held, e.unidentifiable, strict=True))
+    fixed = dict(zip(e.observability.fixed, e.observability.unidentifiable, strict=True))
     return [
         {
             "index": i,
@@ -139,9 +139,11 @@ def _parameters(e: Estimate) -> list[dict[str, Any]]:
             "unit": MILLI_UNIT[unit],
             "fixed": fixed.get(name, ""),
             "partners": partners.get(name, []),
-            "sigmas": None if is_nuisance(name) or not e.std[i] > 0 else abs(e.deviations[i] / e.std[i]),
+            "sigmas": None
+            if is_nuisance(name) or not e.fit.std[i] > 0
+            else abs(e.fit.deviations[i] / e.fit.std[i]),
         }
-        for i, (name, unit) in enumerate(zip(e.parameters, e.units, strict=True))
+        for i, (name, unit) in enumerate(zip(e.fit.parameters, e.fit.units, strict=True))
     ]
 
 
@@ -149,7 +151,7 @@ def _structure(e: Estimate) -> list[dict[str, Any]]:
     """Which trends the residuals show, with the key of each."""
     return [
         {"key": f"estimate.structure.{i}", "joint": s.joint, "kind": s.kind, "sure": s.probability < SIGNIFICANT}
-        for i, s in enumerate(e.structure)
+        for i, s in enumerate(e.diagnostics.structure)
     ]
 
 

@@ -81,7 +81,7 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
     where = np.argwhere(data.seen)
     seen = tuple(where.T)
     states = point_states(estimate)[seen]
-    size = np.linalg.norm(estimate.residuals[seen], axis=1)
+    size = np.linalg.norm(estimate.residuals.vectors[seen], axis=1)
     worst = np.full(len(data), -1.0)
     np.maximum.at(worst, where[:, 0], np.where(states == USED, size, np.inf))
     rows = thinned(worst, MOST_ROBOTS)
@@ -92,12 +92,12 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
         rows=where[:, 0],
         targets=where[:, 1] + 1,
         points=(data.p[seen] - place) @ turn,
-        after=estimate.residuals[seen] @ turn,
+        after=estimate.residuals.vectors[seen] @ turn,
         before=before[seen] @ turn,
         states=states,
         robot_rows=rows,
         robots=bodies(robot, data.q[rows]),
-        test_robots=bodies(robot, estimate.test_poses.reshape(-1, len(robot.joint_names))),
+        test_robots=bodies(robot, estimate.accuracy.test_poses.reshape(-1, len(robot.joint_names))),
         target_count=len(robot.targets),
         tracker=_tracker(problem, turn, place),
     )
@@ -105,10 +105,10 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
 
 def point_states(estimate: Estimate) -> IntArray:
     """(N, targets) state of each point; ``USED`` where there is none."""
-    states = np.full(estimate.normalised_residuals.shape, USED)
-    for state, points in ((SUSPECT, estimate.suspects), (REJECTED, estimate.rejected)):
+    states = np.full(estimate.residuals.normalised.shape, USED)
+    for state, points in ((SUSPECT, estimate.points.suspects), (REJECTED, estimate.points.rejected)):
         for point in points:
-            states[point["row"], point["target"] - 1] = state
+            states[point.row, point.target - 1] = state
     return states
 
 

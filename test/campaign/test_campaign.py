@@ -59,7 +59,7 @@ def test_the_result_is_that_of_its_measurements():
     again = identify(
         IdentificationProblem(problem.robot, result.fit, SIGMA, loss="robust", test_poses=POSE),
     )
-    np.testing.assert_allclose(again.deviations, result.estimate.deviations, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(again.fit.deviations, result.estimate.fit.deviations, rtol=0, atol=1e-12)
     assert result.verdict.level in ("PASS", "WARN")
     apart = np.abs(result.validation.q[:, None] - result.fit.q[None]) * (
         1 / np.ptp(problem.robot.joint_limits, 1)
@@ -171,7 +171,7 @@ def test_gross_errors_are_left_out():
         return measure(action) + (0.02 if count in (9, 14) else 0.0)
 
     result = run_campaign(problem, sometimes_wrong)
-    assert result.outcome == "reached" and len(result.estimate.rejected) == 2
+    assert result.outcome == "reached" and len(result.estimate.points.rejected) == 2
     assert achieved(result, world, POSE) < 3 * result.accuracy
 
 

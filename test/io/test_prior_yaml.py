@@ -132,12 +132,12 @@ def test_an_estimate_gives_values_and_covariance(before: tuple[Path, Any]) -> No
     path, estimate = before
     robot = mixed().with_parameters(["nod.offset", "slide.x", "slide.z"], ["base"])
     found = read_prior(path, robot)
-    assert set(found.prior.names) == {"nod.offset", "slide.x"} - set(estimate.held)
-    at = [estimate.parameters.index(n) for n in found.prior.names]
-    np.testing.assert_array_equal(found.prior.values, estimate.values[at])
-    np.testing.assert_array_equal(found.prior.covariance, estimate.covariance[np.ix_(at, at)])
+    assert set(found.prior.names) == {"nod.offset", "slide.x"} - set(estimate.observability.fixed)
+    at = [estimate.fit.parameters.index(n) for n in found.prior.names]
+    np.testing.assert_array_equal(found.prior.values, estimate.fit.values[at])
+    np.testing.assert_array_equal(found.prior.covariance, estimate.fit.covariance[np.ix_(at, at)])
     assert {"base.x", "target_1.x", "target_2.z"} <= set(found.left_out)
-    assert not set(found.left_out) & {*found.prior.names, *estimate.held}
+    assert not set(found.left_out) & {*found.prior.names, *estimate.observability.fixed}
     assert str(path) in found.prior.source
 
 
@@ -145,7 +145,9 @@ def test_targets_are_taken_over_if_asked_for(before: tuple[Path, Any]) -> None:
     path, estimate = before
     robot = mixed().with_parameters(["nod.offset"], ["base", "tool"])
     found = read_prior(path, robot, targets=True)
-    targets = [n for n in estimate.parameters if n.startswith("target_") and n not in estimate.held]
+    targets = [
+        n for n in estimate.fit.parameters if n.startswith("target_") and n not in estimate.observability.fixed
+    ]
     assert set(found.prior.names) >= set(targets) and "base.x" in found.left_out
     assert not any(n.startswith("base.") for n in found.prior.names)
 

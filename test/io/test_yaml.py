@@ -190,12 +190,16 @@ def test_estimates_come_back_to_the_bit(tmp_path: Path, placed: Estimate) -> Non
     write_estimate(path, placed)
     read = read_estimate(path)
     for name in ("nominal", "values", "deviations", "std", "covariance"):
-        assert getattr(read, name).tobytes() == getattr(placed, name).tobytes(), name
+        assert getattr(read, name).tobytes() == getattr(placed.fit, name).tobytes(), name
         assert not getattr(read, name).flags.writeable
-    assert np.isnan(read.std).sum() == len(placed.held) > 0 and read.status == "rank_deficient"
-    assert (read.parameters, read.units, read.sigma) == (placed.parameters, placed.units, placed.sigma)
-    assert read.predicted_accuracy_per_test_pose.tobytes() == placed.predicted_accuracy_per_test_pose.tobytes()
-    assert repr(read.noise) == repr(placed.noise) and repr(read.chi_square) == repr(placed.chi_square)
+    assert np.isnan(read.std).sum() == len(placed.observability.fixed) > 0 and read.status == "rank_deficient"
+    assert (read.parameters, read.units, read.sigma) == (
+        placed.fit.parameters,
+        placed.fit.units,
+        placed.noise.sigma,
+    )
+    assert read.predicted_accuracy_per_test_pose.tobytes() == placed.accuracy.predicted.tobytes()
+    assert repr(read.noise) == repr(placed.noise) and repr(read.chi_square) == repr(placed.residuals.chi_square)
     assert read.verdict == placed.verdict
     assert {k: v for k, v in read.document.items() if k in placed.to_dict()} == placed.to_dict()
     write_estimate(again, read)
@@ -248,11 +252,11 @@ def test_what_cannot_be_predicted_stays_infinite(tmp_path: Path) -> None:
     q = [[a, 0.0] for a in np.linspace(-2, 2, 12)]
     data = SimulatedCell(robot, {"l1": 1e-3}).measure(q, 1, 2)
     estimate = identify(IdentificationProblem(robot, data, test_poses=[[0.1, 1.5], [0.2, 0.0]]))
-    assert np.isinf(estimate.predicted_accuracy) and estimate.to_dict()["predicted_accuracy"] is None
+    assert np.isinf(estimate.accuracy.overall) and estimate.to_dict()["predicted_accuracy"] is None
     path = tmp_path / "estimate.yaml"
     write_estimate(path, estimate)
     read = read_estimate(path)
-    assert read.predicted_accuracy_per_test_pose.tobytes() == estimate.predicted_accuracy_per_test_pose.tobytes()
+    assert read.predicted_accuracy_per_test_pose.tobytes() == estimate.accuracy.predicted.tobytes()
     assert read.document["predicted_accuracy"] == np.inf and "predicted_accuracy: .inf" in path.read_text()
     write_estimate(tmp_path / "again.yaml", read)
     assert (tmp_path / "again.yaml").read_bytes() == path.read_bytes()
@@ -264,12 +268,12 @@ def test_an_estimate_without_redundancy_has_no_uncertainty(tmp_path: Path) -> No
     q = np.array([[0.3, 0.5]])
     data = Measurements(robot.joint_names, q, robot.positions(q) + 1e-4)
     estimate = identify(IdentificationProblem(robot, data))
-    assert np.isnan(estimate.std).all() and np.isnan(estimate.sigma)
+    assert np.isnan(estimate.fit.std).all() and np.isnan(estimate.noise.sigma)
     write_estimate(tmp_path / "estimate.yaml", estimate)
     read = read_estimate(tmp_path / "estimate.yaml")
-    np.testing.assert_array_equal(read.std, estimate.std)
-    np.testing.assert_array_equal(read.covariance, estimate.covariance)
-    assert np.isnan(read.sigma) and read.deviations.tobytes() == estimate.deviations.tobytes()
+    np.testing.assert_array_equal(read.std, estimate.fit.std)
+    np.testing.assert_array_equal(read.covariance, estimate.fit.covariance)
+    assert np.isnan(read.sigma) and read.deviations.tobytes() == estimate.fit.deviations.tobytes()
 
 
 @pytest.fixture(scope="module")
@@ -283,22 +287,28 @@ def small() -> Estimate:
 @given(data=st.data())
 def test_any_numbers_come_back(small: Estimate, data: st.DataObject) -> None:
     """Whatever stands in an estimate: extreme, denormal, −0, infinite where that can be, any text."""
-    p = len(small.parameters)
+    p = len(small.fit.parameters)
     finite = {n: data.draw(hnp.arrays(float, (p,), elements=FINITE)) for n in ("nominal", "deviations", "std")}
     per = data.draw(hnp.arrays(float, (1,), elements=st.floats(0, np.inf) | st.just(np.nan)))
-    texts = {n: data.draw(TEXT) for n in ("robot", "message", "prior")}
+    texts = {n: data.draw(TEXT) for n in ("robot", "prior")}
     with np.errstate(over="ignore", invalid="ignore"):
-        written = replace(small, **finite, **texts, parameter_accuracy_per_test_pose=per)
-        assume(np.isfinite(written.values).all())
+        written = replace(
+            small,
+            calibrated=replace(small.calibrated, name=texts["robot"]),
+            fit=replace(small.fit, **finite),
+            observability=replace(small.observability, prior=texts["prior"]),
+            accuracy=replace(small.accuracy, parameters=per),
+        )
+        assume(np.isfinite(written.fit.values).all())
         with tempfile.TemporaryDirectory() as folder:
             path, again = Path(folder) / "estimate.yaml", Path(folder) / "again.yaml"
             write_estimate(path, written)
             read = read_estimate(path)
             write_estimate(again, read)
             assert again.read_bytes() == path.read_bytes()
-        expected = numbers(written.predicted_accuracy_per_test_pose)
+        expected = numbers(written.accuracy.predicted)
     for name in finite:
-        assert getattr(read, name).tobytes() == getattr(written, name).tobytes()
+        assert getattr(read, name).tobytes() == getattr(written.fit, name).tobytes()
     assert numbers(read.predicted_accuracy_per_test_pose) == expected
     assert {n: read.document[n] for n in texts} == texts
 

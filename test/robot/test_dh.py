@@ -243,8 +243,10 @@ def test_parallel_axes_hide_their_d_and_the_twist_between_them(tmp_path):
     cell = SimulatedCell(robot, {"j2.d": 1e-3, "j3.d": 5e-4, "j2.a": 1e-3}, 1e-5)
     asked = robot.with_parameters("j2.d,j3.d,j2.a")
     found = identify(IdentificationProblem(asked, cell.measure(q, 1, 0), sigma=1e-5))
-    assert len(found.held) == 1 and "j3.d" in str(found.held) + str(found.to_dict()["unidentifiable"])
-    values = dict(zip(found.parameters, found.deviations, strict=True))
+    assert len(found.observability.fixed) == 1 and "j3.d" in str(found.observability.fixed) + str(
+        found.to_dict()["unidentifiable"]
+    )
+    values = dict(zip(found.fit.parameters, found.fit.deviations, strict=True))
     assert values["j2.d"] + values["j3.d"] == pytest.approx(1.5e-3, abs=2e-5)
 
 
