@@ -64,7 +64,7 @@ def problem_of(settings: CampaignParameters, model: Model | NotReady) -> Campaig
         robot,
         np.array(settings.test_pose_rows),
         settings.required_accuracy,
-        constraints=constraints_of(settings, robot),  # type: ignore[arg-type]
+        constraints=constraints_of(settings, robot),
         identification={"joint_corrections": settings.joint_corrections},
         **{name: getattr(settings, name) for name in SAME},
     )

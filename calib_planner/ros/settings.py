@@ -26,6 +26,7 @@ from calib_planner.units import cut
 
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas between"
 UNKNOWN = "what else is unknown: base, tool or base,tool"
+CONSTRAINTS = "what may be measured: name of a file in constraints_folder; empty = joint limits only"
 TOPICS = "topics of the tracker's points, one per target"
 LARGEST_SEED = 2**31 - 1
 
@@ -66,6 +67,7 @@ class PlanParameters(RobotParameters):
 
     parameters: str = parameter("lengths+offsets", LEVEL)
     unknown: str = parameter("", UNKNOWN)
+    constraints: str = parameter("", CONSTRAINTS)
     constraints_folder: str = parameter(
         "", "folder of the files of constraints; empty = the package's config", read_only=True
     )
@@ -76,9 +78,6 @@ class PlanParameters(RobotParameters):
         for word in unknown_words(self.unknown):
             if word not in ("base", "tool"):
                 raise UnknownNameError("unknown", cut(word, 100), ("base", "tool"))
-
-
-CONSTRAINTS = "what may be measured: name of a file in constraints_folder; empty = joint limits only"
 
 
 @dataclass(frozen=True)
@@ -232,7 +231,6 @@ class CampaignParameters(PlanParameters):
     joint_corrections: str = parameter(
         "auto", "identify errors of the joints' transmissions where the data show them", choices=("auto", "off")
     )
-    constraints: str = parameter("", CONSTRAINTS)
     starts: int = parameter(16, "random starts of the search of a plan", "", 1, 100000)
     seed: int = parameter(0, "seed of the plans", "", 0, LARGEST_SEED)
     store_folder: str = parameter(
