@@ -18,7 +18,7 @@ from calib_planner.cli import main
 from calib_planner.identification import RULES
 
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "paper" / "README.md", *sorted(DOCS.rglob("*.md"))]
 KINDS = {"bash run", "python", "text output", "text", "yaml", "{toctree}", "{eval-rst}"}
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 

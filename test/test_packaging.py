@@ -53,7 +53,7 @@ def imported(folder: Path) -> set[str]:
                 found |= {name.name.split(".")[0] for name in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 found.add((node.module or "").split(".")[0])
-    return found - set(sys.stdlib_module_names) - {"calib_planner"}
+    return found - set(sys.stdlib_module_names) - {"calib_planner", "calib_planner_paper"}
 
 
 def launched() -> set[str]:
@@ -78,7 +78,7 @@ def setup_call() -> dict[str, Any]:
 
 
 def test_package_xml_names_all_that_is_imported_or_launched_and_nothing_else() -> None:
-    needed = imported(PACKAGE) | imported(ROOT / "launch") | launched()
+    needed = imported(PACKAGE) | imported(ROOT / "paper") | imported(ROOT / "launch") | launched()
     assert needed <= ROS | set(KEYS) | EXTRAS, "unknown: find its rosdep key, or make it an extra"
     assert set(keys("exec_depend")) == {KEYS.get(name, name) for name in needed - EXTRAS}
 
