@@ -184,8 +184,8 @@ LEFT_DEEP = {"campaign_faults.py": 1, "pools.py": 4}
 
 
 def examples_and_benches() -> Iterator[tuple[str, str]]:
-    """(where, Python text) of the benches and of every example of README and docs."""
-    for path in sorted((ROOT / "bench").glob("*.py")):
+    """(where, Python text) of the benches, of the tools and of every example of README and docs."""
+    for path in sorted([*(ROOT / "bench").glob("*.py"), *(ROOT / "tools").rglob("*.py")]):
         yield path.name, path.read_text(encoding="utf-8")
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         for number, text in enumerate(re.findall(r"^```python\n(.*?)^```$", path.read_text(), re.DOTALL | re.M)):

@@ -13,12 +13,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from markdown import MADE, code, escaped, joined, table
 
 from calib_planner import errors
-from calib_planner.cli.main import CLOSED_PIPE, DONE, FAILED, INTERRUPTED, WRONG_USAGE
+from calib_planner.cli import CLOSED_PIPE, DONE, FAILED, INTERRUPTED, WRONG_USAGE
 from calib_planner.compensation import STATUS as COMPENSATION
-from calib_planner.identification import RULES, Rule, verdict
+from calib_planner.identification import RULES, Rule
 from calib_planner.identification import STATUS as ESTIMATE
-from calib_planner.planning.certify.prove import PROOF_STATUS
-from calib_planner.planning.result import STATUS as PLAN
+from calib_planner.planning import PROOF_STATUS
+from calib_planner.planning import STATUS as PLAN
 
 INTRODUCTION = """\
 Programs should look at these words; the messages beside them are for people. Those of ROS 2 interfaces are
@@ -46,7 +46,7 @@ def page() -> str:
         ("Corrected targets (`compensate`), row by row", COMPENSATION),
     ):
         lines += [f"## {title}", "", *_statuses(status)]
-    lines += ["## Verdict of an estimate", "", _sentence(verdict), ""]
+    lines += ["## Verdict of an estimate", "", _sentence(inspect.getmodule(Rule)), ""]
     lines += table(("code", "level", "found", "advice"), reasons(RULES.values()))
     exits = [(str(status), words) for status, words in EXIT.items()]
     lines += ["## Exit status of `calib-planner`", "", *table(("status", "meaning"), exits)]
