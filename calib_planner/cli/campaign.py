@@ -158,9 +158,9 @@ def _by_hand(args: argparse.Namespace, problem: CampaignProblem, terminal: Termi
         _answer(args, terminal, action.result, {})
         return
     numbers = list(dict.fromkeys(state.queue))
-    q = np.array([state.stops[i].q for i in numbers])
+    q = np.array([state.configurations[i].q for i in numbers])
     times = [state.queue.count(i) for i in numbers]
-    role = state.stops[numbers[0]].role
+    role = state.configurations[numbers[0]].role
     if args.next:
         write_configurations(args.next, problem.robot.joint_names, q, times, field="--next")
     result = {
@@ -202,7 +202,7 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
 
         def watch(state: CampaignState) -> None:
             accuracy = f", {length(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
-            update(state.spent() / problem.budget, f"{len(state.of_role(FIT))} measured{accuracy}")
+            update(state.spent() / problem.budget, f"{len(state.measurements_of(FIT))} measured{accuracy}")
 
         result, world, errors = simulate_campaign(
             problem, args.simulate, sigma, noise, args.simulate_transmission, watch
@@ -288,7 +288,7 @@ def show_next(state: CampaignState, q: FloatArray, times: Sequence[int], console
     console.print(f"{state.outcome + ': ' if state.outcome else ''}{state.message}")
     if state.rounds:
         console.print(rounds_table(state.rounds))
-    held_out = state.stops[state.queue[0]].role == VALIDATION
+    held_out = state.configurations[state.queue[0]].role == VALIDATION
     title = "measure next, for validation" if held_out else "measure next, in this order"
     console.print(configurations_table(title, robot, q, times))
 
