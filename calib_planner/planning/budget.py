@@ -62,7 +62,7 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
     for k in _sizes(smallest):
         if k >= smallest + TRIED and best is not None:
             break
-        # The least multiple of k that is not below ``fewest`` may not be fewer than the best number of measurements.
+        # The least multiple of k not below ``fewest`` may be no fewer than the best number of measurements.
         beaten = best is not None and fewest > 0 and k * -(-fewest // k) >= best.measurements
         candidate = None if beaten else _smallest_repetition(problem, k, accuracy)
         watch(min(k - smallest + 1, TRIED), TRIED)

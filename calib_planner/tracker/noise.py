@@ -107,4 +107,4 @@ def covariance_gradient(noise: Noise, points: FloatArray) -> FloatArray:
     """∂Σ/∂p, shape (…, 3, 3, 3) with the coordinate of p last, by complex steps: exact to rounding."""
     step = 1e-30
     moved = points[..., None, :] + 1j * step * np.eye(3)
-    return np.moveaxis(noise.covariance(moved).imag / step, -3, -1)
+    return np.ascontiguousarray(np.moveaxis(noise.covariance(moved).imag / step, -3, -1))
