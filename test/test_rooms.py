@@ -291,7 +291,7 @@ OLD_NAMES = {
 OLD_TEXT = {
     r"worth": "value",
     r"slopes?": "gradient",
-    r"relax(?:ed|ation)?": "approximate design",
+    r"relaxed|relaxation": "approximate design",  # limits may be relaxed, designs are approximate
     r"pools?": "candidates",
     r"asked": "problem, request, wanted",
     r"(?<!not )found": "identified, estimated, computed …",

@@ -74,7 +74,7 @@ def add(commands: Commands, summary: str) -> None:
     work = add_problem(parser, any_criterion=True)
     size = work.add_mutually_exclusive_group(required=True)
     option(size, "--configurations", "M", "number of different configurations", kind=int)
-    text = "number of measurements in all; the number of different configurations is found out"
+    text = "number of measurements in all; the program chooses the number of different configurations"
     option(size, "--measurements", "N", text, kind=int)
     option(size, "--accuracy", "A", "take the fewest measurements that reach this ρ0 [m]", kind=float)
     option(work, "--repetitions", "K", "number of measurements at each configuration (1)", kind=int)

@@ -52,11 +52,11 @@ def page() -> str:
     ):
         lines += [f"## {title}", "", *_statuses(status)]
     lines += ["## Verdict of an estimate", "", _sentence(inspect.getmodule(Rule)), ""]
-    lines += table(("code", "level", "found", "advice"), reasons(RULES.values()))
+    lines += table(("code", "level", "text", "advice"), reasons(RULES.values()))
     lines += ["## Outcome of a campaign", "", *_statuses(OUTCOMES)]
     lines += ["## Verdict of a campaign", "", CAMPAIGN_VERDICT, ""]
     lines += table(
-        ("code", "level", "found", "advice"), reasons(r for k, r in CAMPAIGN.items() if k not in OUTCOMES)
+        ("code", "level", "text", "advice"), reasons(r for k, r in CAMPAIGN.items() if k not in OUTCOMES)
     )
     exits = [(str(status), words) for status, words in EXIT.items()]
     lines += ["## Exit status of `calib-planner`", "", *table(("status", "meaning"), exits)]
