@@ -33,17 +33,17 @@ if TYPE_CHECKING:
         Search,
         plan,
     )
+else:
+    __getattr__, __dir__, __all__ = lazy_door(
+        __name__,
+        {
+            "errors": "CalibPlannerError FileFormatError InfeasibleError InputError NotEnoughDataError "
+            "UnknownNameError",
+            "identification": "Estimate IdentificationProblem identify validate",
+            "io": "Robot",  # ``Robot.load`` reads files, which is what ``io`` teaches it
+            "measurements": "Measurements",
+            "planning": "Candidates Plan PlanPrior PlanProblem PlanQuality Progress Search plan",
+        },
+    )
 
 __version__ = "0.1.0"
-
-__getattr__, __dir__, __all__ = lazy_door(
-    __name__,
-    {
-        "errors": "CalibPlannerError FileFormatError InfeasibleError InputError NotEnoughDataError "
-        "UnknownNameError",
-        "identification": "Estimate IdentificationProblem identify validate",
-        "io": "Robot",  # ``Robot.load`` reads files, which is what ``io`` teaches it
-        "measurements": "Measurements",
-        "planning": "Candidates Plan PlanPrior PlanProblem PlanQuality Progress Search plan",
-    },
-)

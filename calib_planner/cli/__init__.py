@@ -22,9 +22,9 @@ from calib_planner.doors import lazy_door
 if TYPE_CHECKING:
     from calib_planner.cli.arguments import Commands, add_command, add_seed
     from calib_planner.cli.terminal import Terminal
-
-__getattr__, __dir__, __all__ = lazy_door(
-    __name__,
-    {"arguments": "Commands add_command add_seed", "terminal": "Terminal"},
-    *("CLOSED_PIPE", "DONE", "EPILOG", "FAILED", "INTERRUPTED", "WRONG_USAGE", "main", "parser"),
-)
+else:
+    __getattr__, __dir__, __all__ = lazy_door(
+        __name__,
+        {"arguments": "Commands add_command add_seed", "terminal": "Terminal"},
+        *("CLOSED_PIPE", "DONE", "EPILOG", "FAILED", "INTERRUPTED", "WRONG_USAGE", "main", "parser"),
+    )

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         write_measurements,
     )
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
-    from calib_planner.io.journal import Journal, begin_journal, open_journal
     from calib_planner.io.kinematics import write_kinematics
     from calib_planner.io.plan import read_plan, write_plan
     from calib_planner.io.prior import read_prior
@@ -43,10 +42,13 @@ if TYPE_CHECKING:
         OUTLIER,
         UNDONE,
         CampaignStore,
-        Decision,
+        Journal,
+        Record,
         StoredCampaign,
         StoredModel,
         UnavailableStore,
+        begin_journal,
+        open_journal,
         open_store,
         stored_model,
     )
@@ -59,29 +61,28 @@ if TYPE_CHECKING:
         require_urdf,
         write_calibrated_urdf,
     )
-
-__getattr__, __dir__, __all__ = lazy_door(
-    __name__,
-    {
-        "bag": "BagTopics is_bag read_bag",
-        "conditions": "read_constraints read_instrument",
-        "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
-        "read_plan_csv write_configurations write_measurements",
-        "estimate": "calibrated_robot placement read_estimate write_estimate",
-        "journal": "Journal begin_journal open_journal",
-        "kinematics": "write_kinematics",
-        "plan": "read_plan write_plan",
-        "prior": "read_prior",
-        "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
-        "sources": "Sources SourceSettings read_source read_sources",
-        "store": "ACCEPTED KEPT LONGEST OUTLIER UNDONE CampaignStore Decision StoredCampaign "
-        "StoredModel UnavailableStore open_store stored_model",
-        "text": "make_folder read_text user_path write_text",
-        "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
-        "write_calibrated_urdf",
-    },
-    "Robot",
-    "URDF_SUFFIXES",
-    "config_folder",
-    "shipped_robots",
-)
+else:
+    __getattr__, __dir__, __all__ = lazy_door(
+        __name__,
+        {
+            "bag": "BagTopics is_bag read_bag",
+            "conditions": "read_constraints read_instrument",
+            "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
+            "read_plan_csv write_configurations write_measurements",
+            "estimate": "calibrated_robot placement read_estimate write_estimate",
+            "kinematics": "write_kinematics",
+            "plan": "read_plan write_plan",
+            "prior": "read_prior",
+            "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
+            "sources": "Sources SourceSettings read_source read_sources",
+            "store": "ACCEPTED KEPT LONGEST OUTLIER UNDONE CampaignStore Journal Record StoredCampaign "
+            "StoredModel UnavailableStore begin_journal open_journal open_store stored_model",
+            "text": "make_folder read_text user_path write_text",
+            "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
+            "write_calibrated_urdf",
+        },
+        "Robot",
+        "URDF_SUFFIXES",
+        "config_folder",
+        "shipped_robots",
+    )

@@ -1,15 +1,30 @@
-"""A campaign on disk: what was accepted is there before anyone is told so.
+"""What a campaign leaves on disk: nothing that was acknowledged is ever lost.
 
-One file, ``campaign.sqlite``, in a folder that the user chose (``campaign_schema``); without a folder the same in
-memory.
+*The store* of an identifier, ``campaign.sqlite`` in a folder that the user chose; without a folder the same in
+memory. Its tables only grow. A *standstill* is raw data and never changes. What was decided about it is a row
+of the log ``decisions``: a later decision replaces an earlier one, and both stay. A *record* is a standstill
+with its last decision, and a campaign is a plan with the records under it. Only the pointer to the current
+campaign moves, and a campaign in which nothing was measured gives way to the next. The model's source text, the
+settings and the version of the package that wrote are kept beside.
 
-Tables only grow: standstills are raw data, decisions about them are a log (``campaign_records``), and a campaign
-is a plan with the decisions made under it. Only the pointer to the current campaign moves, and a campaign in
-which nothing was measured gives way to the next. The model's source text, the settings and the version of the
-package that wrote are kept beside.
+SQLite writes ahead with ``synchronous=FULL``: a commit that returned survives ``kill -9`` and a power cut, one
+that did not leaves nothing behind. ``locking_mode=EXCLUSIVE`` keeps a second process out and needs no file of
+shared memory, which a full disk could tear. A file of another robot, of a newer schema or one that is damaged
+is refused and left as it is. When the disk is full or gone, ``StoreError`` says so, nothing changes, and the
+next attempt may succeed.
 
-A file of another robot, of a newer schema or one that is damaged is refused and left as it is. When the disk is
-full or gone, ``StoreError`` says so, nothing changes, and the next attempt may succeed.
+*The journal* of an adaptive campaign, ``campaign_journal.jsonl``: a line of what it is about, then one JSON
+object per event. A line is on the disk before the campaign goes on; the last one may be torn by a crash and is
+then ignored. The state is rebuilt by ``from_measurements``: what was planned and not measured is planned anew.
+
+    {"format": …, "campaign": "3f2a…", "robot": …, "joint_names": […], "targets": 1}
+    {"measured": 7, "role": "fit", "configuration": […], "points": [[x, y, z]]}      number of the measurement
+    {"withdrawn": 7}
+    {"excluded": […], "radius": 0.05, "reason": "…", "asked": false}
+    {"joined": true}                                  the validation so far is part of the fit from here on
+    {"finished": "reached"}
+
+Numbers are JSON in both, which Python writes and reads exactly to the bit; null is NaN (a target not seen).
 """
 
 from __future__ import annotations
@@ -20,8 +35,8 @@ import os
 import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -30,10 +45,146 @@ import numpy as np
 
 from calib_planner.acquisition import Reason, Rejection, Standstill
 from calib_planner.arrays import FloatArray, frozen, plain
-from calib_planner.errors import FileFormatError, InputError, StoreError
+from calib_planner.campaign import (
+    FIT,
+    VALIDATION,
+    CampaignProblem,
+    CampaignState,
+    Exclusion,
+    Measurement,
+    from_measurements,
+)
+from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, StoreError
 from calib_planner.io.plan import parse_plan
+from calib_planner.io.text import user_path
 from calib_planner.io.yaml import Node
+from calib_planner.measurements import Measurements
 from calib_planner.planning import Plan
+from calib_planner.robot import Robot
+from calib_planner.units import cut
+
+# ── records ──────────────────────────────────────────────────────────────────────────────────────────
+
+ACCEPTED, OUTLIER, UNDONE = "accepted", "outlier", "undone"
+KEPT = (ACCEPTED, OUTLIER)
+"""Decisions about standstills that the identification is given; it rejects outliers itself, every time anew."""
+WIRE = ("configurations", "test_poses")
+"""What is finite in a plan that came in a message, which has no weights."""
+LONGEST = 500
+"""Characters kept of a text that came over a wire."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A standstill and what was decided about it.
+
+    Attributes:
+        acquired: The standstill, or why it was none.
+        status: ``accepted``, ``outlier``, ``undone``, ``not_in_plan``, … or the value of a ``Reason``.
+        reason: In words; empty when accepted in full.
+        index: Row of the plan, or ``None``.
+        repetition: Number of this measurement at its configuration, from 0.
+        unused: Targets, from 0, that the identification rejected.
+        number: Its number in the store, ascending; 0: not stored.
+        frame: Frame of its points.
+    """
+
+    acquired: Standstill | Rejection
+    status: str
+    reason: str
+    index: int | None
+    repetition: int
+    unused: tuple[int, ...] = ()
+    number: int = 0
+    frame: str = ""
+
+    @property
+    def standstill(self) -> Standstill:
+        """The standstill of a record that was accepted at least once."""
+        if not isinstance(self.acquired, Standstill):
+            raise TypeError(f"standstill {self.number} was rejected: {self.acquired.message}")
+        return self.acquired
+
+    def now(self, status: str, reason: str, unused: tuple[int, ...] = ()) -> Record:
+        """The same standstill, decided otherwise."""
+        return replace(self, status=status, reason=reason, unused=unused)
+
+
+def standstill_row(acquired: Standstill | Rejection, frame: str) -> dict[str, Any]:
+    """The columns of a standstill."""
+    row: dict[str, Any] = {"start": acquired.start, "stop": acquired.stop, "joints": _text(acquired.joints)}
+    row |= {"samples": json.dumps(acquired.samples.tolist()), "frame": frame[:LONGEST]}
+    if isinstance(acquired, Rejection):
+        return row | {"rejected": acquired.reason.value, "message": acquired.message[:LONGEST]}
+    return row | {"points": _text(acquired.points), "std": _text(acquired.std), "message": ""}
+
+
+def record_of(path: str | Path, row: Mapping[str, Any], joints: int, targets: int) -> Record:
+    """A record out of the columns of a standstill and of a decision about it.
+
+    Raises:
+        FileFormatError: A number of joints or targets that does not fit, or damaged columns.
+    """
+    where = f"standstill {row['standstill']}"
+
+    def array(key: str, *shape: int) -> FloatArray:
+        return Node(path, f"{where}, {key}", json.loads(row[key])).array(shape, finite=False)
+
+    try:
+        start, stop, q = int(row["start"]), int(row["stop"]), array("joints", joints)
+        samples = frozen(np.array(json.loads(row["samples"]), np.int64))
+        if samples.shape != (targets,):
+            raise FileFormatError(path, f"{where}, samples", f"{samples.size} targets", f"{targets} targets")
+        if row["rejected"] is not None:
+            acquired: Standstill | Rejection
+            acquired = Rejection(start, stop, Reason(row["rejected"]), row["message"], q, samples)
+        else:
+            acquired = Standstill(start, stop, q, array("points", targets, 3), array("std", targets), samples)
+        decided = (row["status"], row["reason"], row["configuration"], row["repetition"])
+        unused = tuple(json.loads(row["unused"]))
+        return Record(acquired, *decided, unused, row["standstill"], row["frame"])
+    except (TypeError, ValueError, KeyError, IndexError) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise FileFormatError(path, where, cut(error, 100), "what this package wrote there") from None
+
+
+def plan_text(plan: Plan | None) -> str | None:
+    """A plan as JSON of its fields, exact to the bit; ``None`` for none."""
+    if plan is None:
+        return None
+    return json.dumps(plain(plan.values(), keep_infinite=True, keep_nan=True))
+
+
+def plan_of(path: str | Path, text: str | None) -> Plan | None:
+    """What ``plan_text`` wrote.
+
+    Raises:
+        FileFormatError: Damaged.
+    """
+    if text is None:
+        return None
+    try:
+        document = json.loads(text)
+    except (TypeError, ValueError) as error:
+        raise FileFormatError(path, "plan", error, "a plan as JSON") from None
+    return parse_plan(Node(path, "plan", document), WIRE)
+
+
+def same_plan(one: Plan | None, other: Plan | None) -> bool:
+    """Whether two plans ask for the same: what was found on the way to them does not count."""
+    if one is None or other is None:
+        return one is other
+    names = ("robot", "joint_names", "parameters", "configurations", "repetitions", "test_poses")
+    return all(np.array_equal(getattr(one, n), getattr(other, n)) for n in names)
+
+
+def _text(values: FloatArray) -> str:
+    """Numbers as JSON, NaN as null."""
+    return json.dumps(plain(values))
+
+
+# ── the store ────────────────────────────────────────────────────────────────────────────────────────
 
 LATEST = """
     SELECT s.*, d.* FROM decisions AS d JOIN standstills AS s ON s.number = d.standstill
@@ -68,18 +219,18 @@ class StoredModel:
 
 @dataclass(frozen=True, eq=False)
 class StoredCampaign:
-    """A plan and what was decided under it.
+    """A plan and what was measured and decided under it.
 
     Attributes:
         number: Of the campaign.
         plan_id, plan: The plan, if any.
-        decisions: The last one about every standstill, in the order of measuring.
+        records: Every standstill with the last decision about it, in the order of measuring.
     """
 
     number: int
     plan_id: str
     plan: Plan | None
-    decisions: tuple[Decision, ...]
+    records: tuple[Record, ...]
 
 
 class CampaignStore:
@@ -101,8 +252,6 @@ class CampaignStore:
         """Let the file go; what was committed is there already."""
         with self._turn:
             self._database.close()
-
-    # ── what there is ────────────────────────────────────────────────────────────────────────────────
 
     def current(self) -> StoredCampaign | None:
         """The campaign that goes on; ``None`` in a new store.
@@ -142,9 +291,7 @@ class CampaignStore:
         sql = "SELECT campaign, status, reason, at FROM decisions WHERE standstill = ? ORDER BY number"
         return [dict(r) for r in self._rows(sql, standstill)]
 
-    # ── what is added ────────────────────────────────────────────────────────────────────────────────
-
-    def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Decision] = ()) -> StoredCampaign:
+    def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Record] = ()) -> StoredCampaign:
         """Make a plan's campaign the current one: the one there is, or a new one.
 
         Args:
@@ -169,37 +316,35 @@ class CampaignStore:
         """
         return self._new(plan_id, plan, ())
 
-    def record(self, campaign: int, decision: Decision) -> int:
+    def record(self, campaign: int, record: Record) -> int:
         """Write a standstill and what was decided about it; returns its number.
 
         Raises:
             StoreError: It cannot be written; nothing was.
         """
         with self._writing() as write:
-            number = _insert(write, "standstills", standstill_row(decision.found, decision.frame))
-            _decide(write, campaign, number, decision)
+            number = _insert(write, "standstills", standstill_row(record.acquired, record.frame))
+            _decide(write, campaign, number, record)
         return number
 
-    def decide(self, campaign: int, decisions: Sequence[Decision]) -> None:
-        """Write what is thought of standstills now, all of it or nothing.
+    def decide(self, campaign: int, records: Sequence[Record]) -> None:
+        """Write what is decided about standstills now, all of it or nothing.
 
         Raises:
             StoreError: It cannot be written; nothing was.
         """
-        if decisions:
+        if records:
             with self._writing() as write:
-                for decision in decisions:
-                    _decide(write, campaign, decision.number, decision)
+                for record in records:
+                    _decide(write, campaign, record.number, record)
 
-    # ── inside ───────────────────────────────────────────────────────────────────────────────────────
-
-    def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Decision]) -> StoredCampaign:
+    def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Record]) -> StoredCampaign:
         with self._writing() as write:
             columns = {"plan_id": plan_id, "plan": plan_text(plan), "at": _now()}
             number = _insert(write, "campaigns", columns)
             self._point_at(write, number)
-            for decision in carried:
-                _decide(write, number, decision.number, decision)
+            for record in carried:
+                _decide(write, number, record.number, record)
         return StoredCampaign(number, plan_id, plan, tuple(carried))
 
     @staticmethod
@@ -214,8 +359,8 @@ class CampaignStore:
     def _campaign(self, row: Mapping[str, Any]) -> StoredCampaign:
         where, joints, targets = self.path or "memory", len(self.model.joint_names), self.model.targets
         rows = self._rows(LATEST, row["number"])
-        decisions = tuple(decision_of(where, r, joints, targets) for r in rows)
-        return StoredCampaign(row["number"], row["plan_id"], plan_of(where, row["plan"]), decisions)
+        records = tuple(record_of(where, r, joints, targets) for r in rows)
+        return StoredCampaign(row["number"], row["plan_id"], plan_of(where, row["plan"]), records)
 
     def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
         try:
@@ -252,11 +397,9 @@ class CampaignStore:
 
     def _roll_back(self) -> None:
         # SQLite may have rolled back itself; a roll-back that fails is made up for by the next BEGIN.
-        try:
+        with suppress(sqlite3.Error):
             if self._database.in_transaction:
                 self._database.execute("ROLLBACK")
-        except sqlite3.Error:
-            return
 
 
 class UnavailableStore(CampaignStore):
@@ -276,9 +419,6 @@ class UnavailableStore(CampaignStore):
         yield
 
 
-# ── opening ──────────────────────────────────────────────────────────────────────────────────────────
-
-
 def open_store(
     folder: str, model: StoredModel, settings: Mapping[str, object], version: str, field: str = "store_folder"
 ) -> CampaignStore:
@@ -296,7 +436,7 @@ def open_store(
         InputError: Another process has it.
         StoreError: It cannot be opened or written now.
     """
-    path = Path(folder).expanduser() / FILE if folder else None
+    path = user_path(folder) / FILE if folder else None
     database = connect(path, field)
     try:
         prepare(database, path, field)
@@ -315,7 +455,7 @@ def stored_model(folder: str, field: str = "store_folder") -> StoredModel | None
     Raises:
         As ``open_store``.
     """
-    path = Path(folder).expanduser() / FILE
+    path = user_path(folder) / FILE
     if not folder or not path.exists():
         return None
     database = connect(path, field)
@@ -335,8 +475,8 @@ def _model_of(row: Mapping[str, Any]) -> StoredModel:
 
 def _check_model(store: CampaignStore) -> None:
     model, row = store.model, store._one("SELECT * FROM model")
-    found = None if row is None else _model_of(row)
-    if found is None or (found != model and store.empty):
+    stored = None if row is None else _model_of(row)
+    if stored is None or (stored != model and store.empty):
         with store._writing() as write:
             write.execute("DELETE FROM current")
             write.execute("DELETE FROM campaigns")
@@ -345,15 +485,17 @@ def _check_model(store: CampaignStore) -> None:
             columns |= {"targets": model.targets, "origin": model.origin, "sha256": model.sha256}
             _insert(write, "model", columns | {"source": model.source, "at": _now()})
         return
-    advice = "choose another folder, or start with the robot that the store belongs to"
-    for field, got, expected in (
-        ("robot", found.name, model.name),
-        ("joint_names", found.joint_names, model.joint_names),
-        ("targets", found.targets, model.targets),
-        ("model of the robot, sha256", found.sha256, model.sha256),
-    ):
+    compared = {name: (getattr(stored, name), getattr(model, name)) for name in ("joint_names", "targets")}
+    names = {"robot": (stored.name, model.name)}
+    _check_same(store.path, names | compared | {"model of the robot, sha256": (stored.sha256, model.sha256)})
+
+
+def _check_same(path: Path | None, values: Mapping[str, tuple[object, object]]) -> None:
+    """Refuse a file of another robot; ``values`` are what the file says and what the robot says, by name."""
+    for name, (got, expected) in values.items():
         if got != expected:
-            raise FileFormatError(store.path, field, got, str(expected), advice)
+            advice = "choose another folder, or start with the robot that the file belongs to"
+            raise FileFormatError(path, name, cut(got, 100), str(expected), advice)
 
 
 def _note_settings(store: CampaignStore, settings: Mapping[str, object], version: str) -> None:
@@ -364,9 +506,17 @@ def _note_settings(store: CampaignStore, settings: Mapping[str, object], version
             _insert(write, "settings", {"version": version, "document": document, "at": _now()})
 
 
-def _decide(write: sqlite3.Connection, campaign: int, standstill: int, decision: Decision) -> None:
-    columns = {"campaign": campaign, "standstill": standstill, **decision_row(decision), "at": _now()}
-    _insert(write, "decisions", columns)
+def _decide(write: sqlite3.Connection, campaign: int, standstill: int, record: Record) -> None:
+    columns = {
+        "campaign": campaign,
+        "standstill": standstill,
+        "status": record.status,
+        "reason": record.reason[:LONGEST],
+        "configuration": record.index,
+        "repetition": record.repetition,
+        "unused": json.dumps(record.unused),
+    }
+    _insert(write, "decisions", columns | {"at": _now()})
 
 
 def _insert(write: sqlite3.Connection, table: str, columns: Mapping[str, Any]) -> int:
@@ -380,168 +530,7 @@ def _now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
 
 
-# ── What a campaign keeps of every standstill, and how it stands in the rows of its store ───────────────────
-# A *standstill* is raw data and never changes. What is thought of it is a *decision*; a later decision replaces
-# an earlier one, and both stay. What a campaign uses is therefore a fold: per standstill the last decision.
-#
-# Numbers are JSON, which Python writes and reads exactly to the bit; null is NaN (a target that was not seen).
-
-ACCEPTED, OUTLIER, UNDONE = "accepted", "outlier", "undone"
-KEPT = (ACCEPTED, OUTLIER)
-"""Decisions about standstills that the identification is given; it rejects outliers itself, every time anew."""
-WIRE = ("configurations", "test_poses")
-"""What is finite in a plan that came in a message, which has no weights."""
-LONGEST = 500
-"""Characters kept of a text that came over a wire."""
-
-
-@dataclass(frozen=True, eq=False)
-class Decision:
-    """What becomes of a standstill.
-
-    Attributes:
-        found: The standstill, or why it was none.
-        status: ``accepted``, ``outlier``, ``undone``, ``not_in_plan``, … or the value of a ``Reason``.
-        reason: In words; empty when accepted in full.
-        index: Row of the plan, or ``None``.
-        repetition: Number of this measurement at its configuration, from 0.
-        unused: Targets, from 0, that the identification rejected.
-        number: Its number in the store, ascending; 0: not stored.
-        frame: Frame of its points.
-    """
-
-    found: Standstill | Rejection
-    status: str
-    reason: str
-    index: int | None
-    repetition: int
-    unused: tuple[int, ...] = ()
-    number: int = 0
-    frame: str = ""
-
-    @property
-    def standstill(self) -> Standstill:
-        """What was found, of a decision that was accepted at least once."""
-        if not isinstance(self.found, Standstill):
-            raise TypeError(f"standstill {self.number} was rejected: {self.found.message}")
-        return self.found
-
-    def now(self, status: str, reason: str, unused: tuple[int, ...] = ()) -> Decision:
-        """The same standstill, decided otherwise."""
-        return replace(self, status=status, reason=reason, unused=unused)
-
-
-# ── rows ─────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def standstill_row(found: Standstill | Rejection, frame: str) -> dict[str, Any]:
-    """The columns of a standstill."""
-    row: dict[str, Any] = {"start": found.start, "stop": found.stop, "joints": _text(found.joints)}
-    row |= {"samples": json.dumps(found.samples.tolist()), "frame": frame[:LONGEST]}
-    if isinstance(found, Rejection):
-        return row | {"rejected": found.reason.value, "message": found.message[:LONGEST]}
-    return row | {"points": _text(found.points), "std": _text(found.std), "message": ""}
-
-
-def decision_row(decision: Decision) -> dict[str, Any]:
-    """The columns of a decision."""
-    return {
-        "status": decision.status,
-        "reason": decision.reason[:LONGEST],
-        "configuration": decision.index,
-        "repetition": decision.repetition,
-        "unused": json.dumps(decision.unused),
-    }
-
-
-def decision_of(path: str | Path, row: Mapping[str, Any], joints: int, targets: int) -> Decision:
-    """A standstill with a decision about it, out of the columns of both.
-
-    Raises:
-        FileFormatError: A number of joints or targets that does not fit, or damaged columns.
-    """
-    where = f"standstill {row['standstill']}"
-    try:
-        return Decision(
-            _found(path, where, row, joints, targets),
-            row["status"],
-            row["reason"],
-            row["configuration"],
-            row["repetition"],
-            tuple(json.loads(row["unused"])),
-            row["standstill"],
-            row["frame"],
-        )
-    except (TypeError, ValueError, KeyError, IndexError) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(path, where, str(error)[:100], "what this package wrote there") from None
-
-
-def _found(
-    path: str | Path, where: str, row: Mapping[str, Any], joints: int, targets: int
-) -> Standstill | Rejection:
-    start, stop = int(row["start"]), int(row["stop"])
-    q = _array(path, f"{where}, joints", row["joints"], (joints,))
-    samples = frozen(np.array(json.loads(row["samples"]), np.int64))
-    if samples.shape != (targets,):
-        raise FileFormatError(path, f"{where}, samples", f"{samples.size} targets", f"{targets} targets")
-    if row["rejected"] is not None:
-        return Rejection(start, stop, Reason(row["rejected"]), row["message"], q, samples)
-    points = _array(path, f"{where}, points", row["points"], (targets, 3))
-    std = _array(path, f"{where}, std", row["std"], (targets,))
-    return Standstill(start, stop, q, points, std, samples)
-
-
-# ── plans ────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def plan_text(plan: Plan | None) -> str | None:
-    """A plan as JSON of its fields, exact to the bit; ``None`` for none."""
-    if plan is None:
-        return None
-    return json.dumps(plain(plan.values(), keep_infinite=True, keep_nan=True))
-
-
-def plan_of(path: str | Path, text: str | None) -> Plan | None:
-    """What ``plan_text`` wrote.
-
-    Raises:
-        FileFormatError: Damaged.
-    """
-    if text is None:
-        return None
-    try:
-        document = json.loads(text)
-    except (TypeError, ValueError) as error:
-        raise FileFormatError(path, "plan", error, "a plan as JSON") from None
-    return parse_plan(Node(path, "plan", document), WIRE)
-
-
-def same_plan(one: Plan | None, other: Plan | None) -> bool:
-    """Whether two plans ask for the same: what was found on the way to them does not count."""
-    if one is None or other is None:
-        return one is other
-    names = ("robot", "joint_names", "parameters", "configurations", "repetitions", "test_poses")
-    return all(np.array_equal(getattr(one, n), getattr(other, n)) for n in names)
-
-
-# ── numbers ──────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _text(values: FloatArray) -> str:
-    """Numbers as JSON, NaN as null."""
-    return json.dumps(plain(values))
-
-
-def _array(path: str | Path, where: str, text: str, shape: tuple[int, ...]) -> FloatArray:
-    return Node(path, where, json.loads(text)).array(shape, finite=False)
-
-
-# ── The file of a campaign store: made, opened for one process alone, checked, and brought up to date ───────
-# SQLite with a write-ahead log and ``synchronous=FULL``: a commit that returned survives ``kill -9`` and a power
-# cut, one that did not leaves nothing behind. ``locking_mode=EXCLUSIVE`` keeps a second process out and needs no
-# file of shared memory, which a full disk could tear.
+# ── the file of a store: made, opened for one process alone, checked, and brought up to date ─────────────────
 
 FILE = "campaign.sqlite"
 APPLICATION = 0x43504C53
@@ -593,10 +582,10 @@ def prepare(database: sqlite3.Connection, path: Path | None, field: str) -> None
     """Take the file for this process, check that it is ours and whole, bring its schema up to date."""
     try:
         database.execute("PRAGMA locking_mode = EXCLUSIVE")
-        found = int(database.execute("PRAGMA application_id").fetchone()[0])
+        owner = int(database.execute("PRAGMA application_id").fetchone()[0])
         schema = int(database.execute("PRAGMA user_version").fetchone()[0])
         used = bool(database.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0])
-        if used and found != APPLICATION:
+        if used and owner != APPLICATION:
             raise FileFormatError(path, field, "a database of another program", "a campaign store, or no file")
         if schema > len(MIGRATIONS):
             got, most = f"schema {schema}, written by a newer version", f"a schema up to {len(MIGRATIONS)}"
@@ -632,9 +621,8 @@ def _settle(path: Path | None) -> None:
     if path is not None:
         handle = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(handle)
-        except OSError:  # not every file system can
-            pass
+            with suppress(OSError):  # not every file system can
+                os.fsync(handle)
         finally:
             os.close(handle)
 
@@ -642,7 +630,193 @@ def _settle(path: Path | None) -> None:
 def identity(path: Path) -> tuple[int, int] | None:
     """What tells the file from another one put in its place; ``None`` if it is not there."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
+
+
+# ── the journal ──────────────────────────────────────────────────────────────────────────────────────
+
+JOURNAL = "campaign_journal.jsonl"
+JOURNAL_FORMAT = "calib_planner campaign journal 1"
+JOURNAL_WHAT = "a campaign journal that this package wrote"
+MOST_BYTES = 200_000_000
+WRITABLE = "choose a folder that can be written to"
+
+
+@contextmanager
+def _disk(path: Path, advice: str) -> Iterator[None]:
+    """Errors of the operating system become ``StoreError``."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(path, error.strerror or str(error), advice) from None
+
+
+@dataclass(frozen=True, eq=False)
+class Journal:
+    """A file that only grows; made by ``begin_journal`` or ``open_journal``."""
+
+    path: Path
+
+    def note(self, before: CampaignState, after: CampaignState) -> None:
+        """Write what became of ``before``.
+
+        Raises:
+            StoreError: It cannot be written.
+        """
+        lines: list[dict[str, Any]] = []
+        was = [c.role for c in before.configurations]
+        if was != [c.role for c in after.configurations[: len(was)]]:
+            lines.append({"joined": True})
+        now = {r.number: r for r in after.measurements}
+        then = {r.number: r for r in before.measurements}
+        lines += [{"withdrawn": number} for number in then if number not in now]
+        lines += [_row_line(after, r) for number, r in now.items() if then.get(number) is not r]
+        lines += [_exclusion_line(e) for e in after.exclusions[len(before.exclusions) :]]
+        if after.result is not None and before.result is None:
+            lines.append({"finished": after.outcome})
+        self._append(lines)
+
+    def _append(self, lines: list[dict[str, Any]]) -> None:
+        if not lines:
+            return
+        text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines)
+        with _disk(self.path, "make space, then go on"), self.path.open("a", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@dataclass(frozen=True, eq=False)
+class StoredJournal:
+    """What a journal holds.
+
+    Attributes:
+        journal: The file.
+        campaign_id: Name of the campaign.
+        rows: ``(number, role, configuration, points)``.
+        exclusions: Configurations given up.
+        finished: The outcome; empty while it is not ended.
+    """
+
+    journal: Journal
+    campaign_id: str
+    rows: tuple[tuple[int, str, list[float], list[Any]], ...] = ()
+    exclusions: tuple[Exclusion, ...] = field(default=())
+    finished: str = ""
+
+    def state(self, problem: CampaignProblem) -> CampaignState:
+        """The campaign as far as it came.
+
+        Raises:
+            InputError: The measurements do not fit the robot.
+        """
+        ordered = sorted(self.rows, key=lambda r: r[1] != FIT)
+        parts = [[r for r in ordered if (r[1] == FIT) == own] for own in (True, False)]
+        data = [_measurements(problem.robot, part) for part in parts]
+        state = from_measurements(problem, data[0], data[1], self.exclusions)
+        pairs = zip(state.measurements, ordered, strict=True)
+        return replace(state, measurements=tuple(replace(m, number=row[0]) for m, row in pairs))
+
+
+def begin_journal(folder: str | Path, campaign_id: str, robot: Robot) -> Journal:
+    """A new journal in ``folder``, which is made if need be; one that is there is kept beside under its name.
+
+    Raises:
+        StoreError: It cannot be written.
+    """
+    path = user_path(folder) / JOURNAL
+    with _disk(path, WRITABLE):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink():
+            raise StoreError(path, "a symbolic link", "move it away")
+        if path.exists():
+            path.rename(path.with_name(f"campaign_journal_before_{campaign_id}.jsonl"))
+    journal = Journal(path)
+    head = {"format": JOURNAL_FORMAT, "campaign": campaign_id, "robot": robot.name}
+    journal._append([head | {"joint_names": list(robot.joint_names), "targets": len(robot.targets)}])
+    return journal
+
+
+def open_journal(folder: str | Path, robot: Robot) -> StoredJournal | None:
+    """What the journal in ``folder`` holds; ``None`` if there is none.
+
+    Raises:
+        FileFormatError: Not a journal, damaged before its last line, or of another robot.
+        StoreError: It cannot be read.
+    """
+    path = user_path(folder) / JOURNAL
+    with _disk(path, "choose a folder that can be read"):
+        if not path.exists():
+            return None
+        if path.stat().st_size > MOST_BYTES:
+            raise FileFormatError(path, "size", f"{path.stat().st_size} bytes", f"at most {MOST_BYTES}")
+        whole = path.read_bytes()
+    end = whole.rfind(b"\n") + 1
+    if end < len(whole):
+        with _disk(path, WRITABLE):  # or the next line would be written behind a torn one
+            os.truncate(path, end)
+    lines = [_parsed(path, number, line) for number, line in enumerate(whole[:end].splitlines(), 1)]
+    if not lines or lines[0].get("format") != JOURNAL_FORMAT:
+        raise FileFormatError(path, "line 1", "something else", JOURNAL_WHAT, "move the file away")
+    robots = {"robot": robot.name, "joint_names": list(robot.joint_names), "targets": len(robot.targets)}
+    _check_same(path, {name: (lines[0].get(name), own) for name, own in robots.items()})
+    try:
+        return _folded(Journal(path), lines, robot)
+    except (KeyError, TypeError, ValueError, OverflowError, CalibPlannerError) as error:
+        raise FileFormatError(path, "events", cut(error, 200), JOURNAL_WHAT, "move the file away") from None
+
+
+def _folded(journal: Journal, lines: list[dict[str, Any]], robot: Robot) -> StoredJournal:
+    rows: dict[int, tuple[int, str, list[float], list[Any]]] = {}
+    exclusions: list[Exclusion] = []
+    finished = ""
+    for line in lines[1:]:
+        if "measured" in line:
+            number, role = int(line["measured"]), str(line["role"])
+            if role not in (FIT, VALIDATION):
+                raise InputError("role", cut(role, 100), f"{FIT} or {VALIDATION}")
+            rows[number] = (number, role, list(line["configuration"]), list(line["points"]))
+        elif "withdrawn" in line:
+            rows.pop(int(line["withdrawn"]), None)
+        elif "excluded" in line:
+            q = np.array(line["excluded"], float).reshape(len(robot.joint_names))
+            exclusions.append(Exclusion(-1, q, float(line["radius"]), str(line["reason"]), bool(line["asked"])))
+        elif "joined" in line:
+            rows = {n: (n, FIT, q, points) for n, (_, _, q, points) in rows.items()}
+        elif "finished" in line:
+            finished = str(line["finished"])
+    for row in rows.values():
+        _measurements(robot, [row])  # refuses what does not fit the robot
+    return StoredJournal(
+        journal, str(lines[0]["campaign"])[:100], tuple(rows.values()), tuple(exclusions), finished
+    )
+
+
+def _measurements(robot: Robot, rows: list[tuple[int, str, list[float], list[Any]]]) -> Measurements | None:
+    if not rows:
+        return None
+    points = np.array([r[3] for r in rows], float)  # null becomes NaN
+    if points.shape[1:] != (len(robot.targets), 3):
+        raise InputError("points", points.shape[1:], f"({len(robot.targets)}, 3), as the robot has targets")
+    return Measurements(robot.joint_names, np.array([r[2] for r in rows], float), points)
+
+
+def _row_line(state: CampaignState, row: Measurement) -> dict[str, Any]:
+    role = state.configurations[row.index].role
+    return {"measured": row.number, "role": role, "configuration": row.q.tolist(), "points": plain(row.points)}
+
+
+def _exclusion_line(out: Exclusion) -> dict[str, Any]:
+    return {"excluded": out.q.tolist(), "radius": out.radius, "reason": out.reason[:500], "asked": out.requested}
+
+
+def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:
+    event = None
+    with suppress(ValueError, RecursionError):
+        event = json.loads(line)
+    if not isinstance(event, dict):
+        raise FileFormatError(path, f"line {number}", ascii(line[:40]), JOURNAL_WHAT, "move the file away")
+    return event

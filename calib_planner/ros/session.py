@@ -31,7 +31,7 @@ from calib_planner.io import (
     OUTLIER,
     UNDONE,
     CampaignStore,
-    Decision,
+    Record,
     StoredCampaign,
     calibrated_urdf,
     write_estimate,
@@ -96,9 +96,9 @@ class Campaign:
 
     def __init__(self, nominal: Robot, follow: Callable[[Plan], Robot], store: CampaignStore) -> None:
         self.nominal, self.robot, self.follow, self.store = nominal, nominal, follow, store
-        self.kept: list[Decision] = []
+        self.kept: list[Record] = []
         self.newest: Estimate | TooFew | None = None
-        self._unsaved: dict[int, Decision] = {}
+        self._unsaved: dict[int, Record] = {}
         self._others: Counter[str] = Counter()
         self._enter(store.current() or StoredCampaign(0, "", None, ()))
 
@@ -135,8 +135,8 @@ class Campaign:
     def _enter(self, stored: StoredCampaign) -> None:
         robot = self.nominal if stored.plan is None else self.follow(stored.plan)
         self.number, self.plan_id, self.plan, self.robot = stored.number, stored.plan_id, stored.plan, robot
-        self.kept = [d for d in stored.decisions if d.status in KEPT]
-        self._others = Counter(d.status for d in stored.decisions if d.status not in KEPT)
+        self.kept = [d for d in stored.records if d.status in KEPT]
+        self._others = Counter(d.status for d in stored.records if d.status not in KEPT)
         self.newest, self._unsaved = None, {}
 
     def _ensure_begun(self) -> int:
@@ -159,7 +159,7 @@ class Campaign:
 
     def take(
         self, found: Standstill, how: Matching, frame: str = "", objection: tuple[str, str] | None = None
-    ) -> Decision:
+    ) -> Record:
         """Decide on a standstill, and keep it if it is accepted and written.
 
         Args:
@@ -168,13 +168,13 @@ class Campaign:
         """
         index, reason = self._match(found.joints, how)
         if objection is not None:
-            return self._reject(Decision(found, *objection, index, 0, frame=frame))
+            return self._reject(Record(found, *objection, index, 0, frame=frame))
         if reason and not how.accept_unplanned:
-            return self._reject(Decision(found, "not_in_plan", reason, None, 0, frame=frame))
+            return self._reject(Record(found, "not_in_plan", reason, None, 0, frame=frame))
         if len(self.kept) >= how.most:
             reason = f"{how.most} measurements are kept at most: raise most_measurements or call ~/reset"
-            return self._reject(Decision(found, "not_in_plan", reason, index, 0, frame=frame))
-        decision = Decision(found, ACCEPTED, "", index, self.done()[index], frame=frame)
+            return self._reject(Record(found, "not_in_plan", reason, index, 0, frame=frame))
+        decision = Record(found, ACCEPTED, "", index, self.done()[index], frame=frame)
         try:
             decision = replace(decision, number=self.store.record(self._ensure_begun(), decision))
         except StoreError as error:
@@ -184,11 +184,11 @@ class Campaign:
         self.newest = None
         return decision
 
-    def refuse(self, found: Rejection, frame: str = "") -> Decision:
+    def refuse(self, found: Rejection, frame: str = "") -> Record:
         """Note a standstill that was none."""
-        return self._reject(Decision(found, found.reason.value, found.message, None, 0, frame=frame))
+        return self._reject(Record(found, found.reason.value, found.message, None, 0, frame=frame))
 
-    def _reject(self, decision: Decision) -> Decision:
+    def _reject(self, decision: Record) -> Record:
         """Count it, and write it if that is possible: it was not promised to anybody."""
         self._others[decision.status] += 1
         if self._others.total() > MOST_REJECTIONS:
@@ -198,7 +198,7 @@ class Campaign:
         except StoreError:
             return decision
 
-    def undo(self, number: int = 0) -> Decision | None:
+    def undo(self, number: int = 0) -> Record | None:
         """Withdraw a measurement, 0 for the newest; ``None`` if there is no such measurement in use.
 
         Raises:
@@ -209,7 +209,7 @@ class Campaign:
             return None
         return self.withdraw(last, UNDONE, "withdrawn on request")
 
-    def withdraw(self, kept: Decision, status: str, reason: str) -> Decision:
+    def withdraw(self, kept: Record, status: str, reason: str) -> Record:
         """Use one of ``kept`` no more.
 
         Raises:
@@ -231,7 +231,7 @@ class Campaign:
         return next((d.frame for d in self.kept if d.frame), "")
 
     @property
-    def accepted(self) -> list[Decision]:
+    def accepted(self) -> list[Record]:
         """What is used, in the order of measuring."""
         return [d for d in self.kept if d.status == ACCEPTED]
 
@@ -308,7 +308,7 @@ class Campaign:
             self.newest = TooFew(0, f"identification failed: {error}")
         return self.newest
 
-    def judge(self) -> list[Decision]:
+    def judge(self) -> list[Record]:
         """Those of ``kept`` about which the newest estimate thinks otherwise than before.
 
         What cannot be written now is written with the next: the data it follows from are there.
@@ -362,7 +362,7 @@ def _nearest_row(plan: Plan, distance: FloatArray, done: Counter[int | None], to
     return min((int(i) for i in near), key=lambda i: (done[i] >= plan.repetitions[i], distance[i]), default=None)
 
 
-def _matched_anew(kept: Iterable[Decision], plan: Plan, tolerance: float) -> tuple[Decision, ...]:
+def _matched_anew(kept: Iterable[Record], plan: Plan, tolerance: float) -> tuple[Record, ...]:
     """Measurements of another plan, at the rows of this one; those of none stay in use, unplanned."""
     done: Counter[int | None] = Counter()
     carried = []

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib_planner import Plan
 from calib_planner.acquisition import Rejection, Standstill
-from calib_planner.io import CampaignStore, Decision, StoredModel, open_store
+from calib_planner.io import CampaignStore, Record, StoredModel, open_store
 
 MODEL = StoredModel("arm", ("q1", "q2"), 2, "links: [1, 0.7]  # Länge")
 
@@ -28,19 +28,19 @@ def standstill(seed: int, *, seen: tuple[bool, bool] = (True, True)) -> Standsti
     return Standstill(start, start + 7, rng.standard_normal(2), points, std, rng.integers(1, 99, 2))
 
 
-def decision(found: Standstill | Rejection, status: str = "accepted", **others: object) -> Decision:
-    return replace(Decision(found, status, "", 1, 0, frame="läser"), **others)  # type: ignore[arg-type]
+def decision(found: Standstill | Rejection, status: str = "accepted", **others: object) -> Record:
+    return replace(Record(found, status, "", 1, 0, frame="läser"), **others)  # type: ignore[arg-type]
 
 
 def begun(store: CampaignStore, plan_id: str = "p", planned: Plan | None = None) -> int:
     return store.begin(plan_id, planned).number
 
 
-def assert_same(a: Decision, b: Decision) -> None:
-    for f in fields(Decision):
-        if f.name != "found":
+def assert_same(a: Record, b: Record) -> None:
+    for f in fields(Record):
+        if f.name != "acquired":
             assert getattr(a, f.name) == getattr(b, f.name), f.name
-    assert type(a.found) is type(b.found)
-    for f in fields(a.found):
-        x, y = getattr(a.found, f.name), getattr(b.found, f.name)
+    assert type(a.acquired) is type(b.acquired)
+    for f in fields(a.acquired):
+        x, y = getattr(a.acquired, f.name), getattr(b.acquired, f.name)
         assert np.array_equal(x, y, equal_nan=True) if isinstance(x, np.ndarray) else x == y, f.name

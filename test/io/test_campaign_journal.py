@@ -21,7 +21,7 @@ from calib_planner.campaign import (
 )
 from calib_planner.errors import StoreError
 from calib_planner.io import Journal, begin_journal, open_journal
-from calib_planner.io.journal import FILE
+from calib_planner.io.store import JOURNAL as FILE
 
 ROBOT = Robot.load("planar_2r")
 PROBLEM = CampaignProblem(ROBOT, [0.2, 0.9], 1e-5)

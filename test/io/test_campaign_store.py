@@ -46,7 +46,7 @@ def test_what_was_written_comes_back_to_the_bit(tmp_path: Path, planned: Plan) -
     found = again.current()
     again.close()
     assert found is not None and (found.number, found.plan_id) == (campaign, "p")
-    for a, number, b in zip(written, numbers, found.decisions, strict=True):
+    for a, number, b in zip(written, numbers, found.records, strict=True):
         assert_same(replace(a, number=number), b)
     assert found.plan is not None
     for name, x in weightless.values().items():
@@ -63,7 +63,7 @@ def test_the_last_decision_counts_and_all_stay(store: CampaignStore) -> None:
     store.decide(campaign, [first.now("accepted", "")])
     found = store.current()
     assert found is not None
-    assert [(d.number, d.status) for d in found.decisions] == [
+    assert [(d.number, d.status) for d in found.records] == [
         (first.number, "accepted"),
         (second.number, "undone"),
     ]
@@ -80,7 +80,7 @@ def test_texts_from_the_wire_are_bounded(store: CampaignStore) -> None:
     store.record(campaign, decision(standstill(1), frame="f" * 10**6, reason="r" * 10**6))
     found = store.current()
     assert found is not None
-    assert len(found.decisions[0].frame) == len(found.decisions[0].reason) == LONGEST
+    assert len(found.records[0].frame) == len(found.records[0].reason) == LONGEST
     with pytest.raises(InputError, match="plan_id"):
         store.begin("p" * 10**6, None)
 
@@ -90,7 +90,7 @@ def test_sql_in_texts_is_text(store: CampaignStore) -> None:
     campaign = begun(store, evil)
     store.record(campaign, decision(standstill(1), frame=evil, reason=evil))
     found = store.current()
-    assert found is not None and found.plan_id == evil and found.decisions[0].reason == evil
+    assert found is not None and found.plan_id == evil and found.records[0].reason == evil
 
 
 # ── plans come and go ────────────────────────────────────────────────────────────────────────────────
@@ -102,9 +102,9 @@ def test_a_plan_that_comes_back_finds_its_measurements(store: CampaignStore, pla
     second = begun(store, "b", planned)
     assert second != first
     found = store.current()
-    assert found is not None and found.number == second and not found.decisions
+    assert found is not None and found.number == second and not found.records
     back = store.begin("a", changed(planned, seconds=9.0))
-    assert back.number == first and len(back.decisions) == 1
+    assert back.number == first and len(back.records) == 1
 
 
 def test_another_plan_of_the_same_name_is_refused(store: CampaignStore, planned: Plan) -> None:
@@ -122,7 +122,7 @@ def test_a_restarted_campaign_keeps_the_old_one(store: CampaignStore, planned: P
     number = store.record(first, decision(standstill(1)))
     assert store.restart("a", planned).number != first
     found = store.current()
-    assert found is not None and not found.decisions and len(store.history(number)) == 1
+    assert found is not None and not found.records and len(store.history(number)) == 1
     store.record(found.number, decision(standstill(2)))
     begun(store, "b", planned)
     assert store.begin("a", planned).number == found.number
@@ -134,8 +134,8 @@ def test_a_new_plan_can_take_measurements_over(store: CampaignStore, planned: Pl
     kept = replace(kept, number=store.record(first, kept), index=3, repetition=2)
     store.begin("b", planned, [kept])
     found = store.current()
-    assert found is not None and len(found.decisions) == 1
-    assert_same(found.decisions[0], kept)
+    assert found is not None and len(found.records) == 1
+    assert_same(found.records[0], kept)
 
 
 def test_plans_by_the_thousand_leave_no_trace(store: CampaignStore, planned: Plan) -> None:
@@ -230,7 +230,7 @@ def test_an_older_schema_is_brought_up_to_date(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(store_file, "MIGRATIONS", more)
     store = opened(tmp_path)
     found = store.current()
-    assert found is not None and len(found.decisions) == 1
+    assert found is not None and len(found.records) == 1
     store._one("SELECT note FROM standstills")
     store.close()
     assert sqlite3.connect(tmp_path / FILE).execute("PRAGMA user_version").fetchone() == (2,)
@@ -279,7 +279,7 @@ def test_damage_is_found_on_opening(tmp_path: Path) -> None:
             refused += 1
         else:  # an unused part of the file was hit
             assert found is not None
-            for k, d in enumerate(found.decisions):
+            for k, d in enumerate(found.records):
                 assert_same(d, replace(decision(standstill(k)), number=k + 1))
         store.close()
     assert refused >= 15
@@ -304,4 +304,4 @@ def test_without_a_folder_it_is_in_memory(tmp_path: Path, monkeypatch: pytest.Mo
     store = opened("")
     store.record(begun(store), decision(standstill(1)))
     found = store.current()
-    assert found is not None and len(found.decisions) == 1 and not list(tmp_path.iterdir())
+    assert found is not None and len(found.records) == 1 and not list(tmp_path.iterdir())

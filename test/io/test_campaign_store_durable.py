@@ -34,7 +34,7 @@ def test_a_full_database_changes_nothing_and_recovers(store: CampaignStore) -> N
         with pytest.raises(StoreError, match="full"):
             store.record(campaign, decision(standstill(1), frame="x" * LONGEST))
     found = store.current()
-    assert found is not None and found.decisions[-1].number == kept
+    assert found is not None and found.records[-1].number == kept
     store._database.execute("PRAGMA max_page_count = 100000")
     assert store.record(campaign, decision(standstill(2))) == kept + 1
 
@@ -53,7 +53,7 @@ def test_a_read_only_disk_changes_nothing_and_recovers(store: CampaignStore, pla
             attempt()
     store._database.execute("PRAGMA query_only = OFF")
     found = store.current()
-    assert found is not None and found.number == campaign and [d.number for d in found.decisions] == [number]
+    assert found is not None and found.number == campaign and [d.number for d in found.records] == [number]
     assert store.record(campaign, decision(standstill(2))) == number + 1
 
 
@@ -93,7 +93,7 @@ def test_writes_that_the_system_refuses(tmp_path: Path) -> None:
     store = opened(tmp_path)
     found = store.current()
     store.close()
-    assert found is not None and [d.number for d in found.decisions] == kept
+    assert found is not None and [d.number for d in found.records] == kept
 
 
 def test_a_file_that_is_taken_away_is_noticed(tmp_path: Path, store: CampaignStore) -> None:
@@ -122,7 +122,7 @@ WRITERS = """
     def write():
         store = opened(sys.argv[1])
         found = store.current() or store.begin("p", None)
-        state = {d.number: d.status for d in found.decisions}
+        state = {d.number: d.status for d in found.records}
         print(os.getpid(), *(f"{n}:{s}" for n, s in state.items()), flush=True)
         k = len(state)
         while True:
@@ -168,7 +168,7 @@ def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
     found = store.current()
     store.close()
     assert found is not None
-    for d in found.decisions:
+    for d in found.records:
         assert_same(d, replace(decision(standstill(d.number)), number=d.number, status=d.status))
 
 

@@ -280,7 +280,7 @@ def campaign_to_its_end(folder: Path, out: Connection) -> None:
 
 def schedule(campaign: Campaign) -> list[tuple[object, int]]:
     """What is still to be done: rows 0 to 11, where 5 goes wrong first and 7 is withdrawn and measured again."""
-    done = {(d.index, d.found.start, tuple(d.found.points.ravel())) for d in everything(campaign)}  # type: ignore[union-attr]
+    done = {(d.index, d.acquired.start, tuple(d.acquired.points.ravel())) for d in everything(campaign)}  # type: ignore[union-attr]
     steps: list[tuple[object, int]] = []
     for row in range(12):
         first = (row, seen(row).start, tuple(seen(row, 2e-3 if row == 5 else 0.0).points.ravel()))
@@ -300,7 +300,7 @@ def schedule(campaign: Campaign) -> list[tuple[object, int]]:
 def everything(campaign: Campaign) -> list[object]:
     found = campaign.store.current()
     assert found is not None
-    return [d for d in found.decisions if isinstance(d.found, Standstill)]
+    return [d for d in found.records if isinstance(d.acquired, Standstill)]
 
 
 @contextmanager

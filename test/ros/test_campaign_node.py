@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 
 from calib_planner import Robot
 from calib_planner.io import read_estimate, read_measurements
-from calib_planner.io.journal import FILE
+from calib_planner.io.store import JOURNAL as FILE
 from calib_planner.ros import campaign as campaign_measuring
 from calib_planner.ros.messages import estimate_from_message
 from calib_planner.ros.nodes import campaign as campaign_node

@@ -12,7 +12,7 @@ from bench import Bench
 from desk import ASKED, Desk, S
 from fake_cell import FakeCell
 
-from calib_planner.io.journal import FILE
+from calib_planner.io.store import JOURNAL as FILE
 from calib_planner.ros.processes import Nodes
 
 NODE = "campaign_node"

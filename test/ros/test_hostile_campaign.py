@@ -29,7 +29,8 @@ from std_srvs.srv import Trigger
 from test_hostile_peer import BIG, PATHS, text_parameter, urdfs
 
 from calib_planner.errors import InputError
-from calib_planner.io.journal import FILE, FORMAT
+from calib_planner.io.store import JOURNAL as FILE
+from calib_planner.io.store import JOURNAL_FORMAT as FORMAT
 from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.qos import EVENTS, LATCHED
 

@@ -117,7 +117,7 @@ def stored(folder: Path) -> list[int | None]:
     store = open_store(str(folder), model, {}, "")
     found = store.current()
     store.close()
-    return [] if found is None else [d.index for d in found.decisions if d.status == ACCEPTED]
+    return [] if found is None else [d.index for d in found.records if d.status == ACCEPTED]
 
 
 @pytest.mark.timeout(300)

@@ -23,7 +23,7 @@ from calib_planner import __version__
 from calib_planner.acquisition import Intake, Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.identification import Estimate
-from calib_planner.io import ACCEPTED, Decision, UnavailableStore, calibrated_urdf, open_store
+from calib_planner.io import ACCEPTED, Record, UnavailableStore, calibrated_urdf, open_store
 from calib_planner.ros import session
 from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
@@ -54,10 +54,10 @@ class IdentifierOutput:
         self._measurements = node.create_publisher(Measurement, "~/measurements", EVENTS)
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
 
-    def decision(self, campaign: Campaign, decision: Decision) -> None:
+    def decision(self, campaign: Campaign, decision: Record) -> None:
         """What became of a standstill."""
         message = measurement_message(
-            decision.found,
+            decision.acquired,
             campaign.nominal.joint_names,
             decision.frame or "tracker",
             status=decision.status,
@@ -92,7 +92,7 @@ class IdentifierOutput:
             )
             if not found.missing:
                 self._log().error(found.message)
-        message.header.stamp = stamp_message(campaign.kept[-1].found.stop if campaign.kept else 0)
+        message.header.stamp = stamp_message(campaign.kept[-1].acquired.stop if campaign.kept else 0)
         self._estimates.publish(message)
 
     def description(self, urdf: str, found: Estimate | TooFew) -> None:
