@@ -37,6 +37,9 @@ from calib_planner.arrays import FloatArray
 
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
 """Names a request may use."""
+RIDGE = 1e-12
+"""Added to the information of a plan while searching, relative to its mean diagonal, so that singular plans stay
+finite."""
 
 
 class Criterion(Protocol):
@@ -239,9 +242,11 @@ class Compound(_Smooth):
             w * np.log(np.maximum(psi / r, 1e-300))
             for w, r, (psi, _) in zip(self.shares, self.references, parts, strict=True)
         )
-        psi = np.exp(log)
-        gradient = sum((w * psi / psi)[:, None, None] * g for w, (psi, g) in zip(self.shares, parts, strict=True))
-        return psi, np.asarray(gradient)
+        value = np.exp(log)
+        gradient = sum(
+            (w * value / psi)[:, None, None] * g for w, (psi, g) in zip(self.shares, parts, strict=True)
+        )
+        return value, np.asarray(gradient)
 
 
 @dataclass(frozen=True)
@@ -323,6 +328,19 @@ def make_criterion(
     if name in ("o2", "o4"):
         return EigenvalueRatio(1.0 if name == "o2" else 2.0)
     return Accuracy(np.einsum("k,kab->ab", share, test_weights))
+
+
+def ridged(matrices: FloatArray) -> FloatArray:
+    """(S, p, p) information matrices with so small a ridge that a singular one has a small value, not none."""
+    ridge = RIDGE * np.einsum("sii->si", matrices).mean(axis=1)
+    return np.asarray(matrices + ridge[:, None, None] * np.eye(matrices.shape[-1]))
+
+
+def log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
+    """log Ψ (S,) of information matrices (S, p, p), −∞ where it is none."""
+    psi = criterion.value_and_gradient(matrices)[0]
+    usable = np.isfinite(psi) & (psi > 0)
+    return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)
 
 
 @dataclass(frozen=True)

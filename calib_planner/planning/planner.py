@@ -23,12 +23,12 @@ from calib_planner.planning.criteria import (
     efficiency,
     reported_value,
 )
+from calib_planner.planning.discrepancy import PredictionProblem, choose_for_prediction
 from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
 from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.planning.result import STATUS, Plan, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
-from calib_planner.planning.search.prediction import choose_for_prediction, prediction_problem
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
 
@@ -258,6 +258,28 @@ def _choose(
     chosen = choose(request, rng, clock.over)
     clock.tell(problem.search.starts, chosen.log_value)
     return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
+
+
+def prediction_problem(problem: PlanProblem, candidates: FloatArray) -> PredictionProblem:
+    """The choice that a plan problem with ``discrepancy`` asks for, from the rows of ``candidates``."""
+    assert problem.discrepancy is not None
+    robot = problem.robot
+    std = problem.discrepancy.prior_std(robot)
+    for name, value in problem.prior.std.items():
+        std[robot.parameter_names.index(name)] = value
+    nothing = np.empty((0, len(robot.joint_names)))
+    return PredictionProblem(
+        robot=robot,
+        candidates=candidates,
+        test_poses=problem.test_pose_array,
+        shares=problem.weight_array / problem.weight_array.sum(),
+        size=problem.configurations,
+        discrepancy=problem.discrepancy,
+        noise=problem.instrument,
+        repetitions=problem.repetitions,
+        prior_std=std,
+        measured=nothing if problem.prior.measured is None else problem.prior.measured.q,
+    )
 
 
 # ── the answer ───────────────────────────────────────────────────────────────────────────────────────

@@ -34,24 +34,19 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers: label, sizes, proposed, lower bound, random {max, min, mean, median} [m]."""
-        result: dict[str, Any] = plain(
+        quality, random = self.proposed.quality, self.random
+        return plain(
             {
                 "label": self.label,
                 "configurations": len(self.proposed.configurations),
                 "repetitions": int(self.proposed.repetitions[0]),
-                "proposed": self.proposed.quality.predicted_accuracy,
-                "lower_bound": self.proposed.quality.lower_bound,
-                "efficiency": self.proposed.quality.efficiency,
-                "random": {
-                    "count": len(self.random),
-                    "max": self.random.max(),
-                    "min": self.random.min(),
-                    "mean": self.random.mean(),
-                    "median": np.median(self.random),
-                },
+                "proposed": quality.predicted_accuracy,
+                "lower_bound": quality.lower_bound,
+                "efficiency": quality.efficiency,
+                "random": {"count": len(random)}
+                | {name: getattr(np, name)(random) for name in ("max", "min", "mean", "median")},
             }
         )
-        return result
 
 
 def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> list[Comparison]:

@@ -76,20 +76,6 @@ class Linearisation:
         p, t, _, n = self.columns.shape
         return np.ascontiguousarray(self.columns.reshape(p, 3 * t, n).transpose(2, 1, 0))
 
-    def jacobian_joint_derivatives(self) -> FloatArray:
-        """∂J/∂q, shape (N, 3·targets, P, joints) [m / unit / rad]; for tests and small problems."""
-        p, t, _, n = self.columns.shape
-        lay = self.layout
-        joints = len(lay.joint_elements)
-        out = np.zeros((p, joints, t, 3, n))
-        for a, (ea, ra) in enumerate(zip(lay.parameter_elements, lay.parameter_rotates, strict=True)):
-            for k, (ek, rk) in enumerate(zip(lay.joint_elements, lay.joint_rotates, strict=True)):
-                if ek <= ea and rk:
-                    out[a, k] = _cross(self.joint_axes[k], self.columns[a])
-                elif ea < ek and ra:
-                    out[a, k] = _cross(self.parameter_axes[a], self.joint_columns[k])
-        return out.reshape(p, joints, 3 * t, n).transpose(3, 2, 0, 1)
-
     def pull_back(self, weights: FloatArray) -> FloatArray:
         """Gradient in the joints of Σ weights · J.
 

@@ -348,7 +348,7 @@ def constrained():
 def test_a_plan_satisfies_every_constraint(constrained):
     """Checked by the plain loop, and by hand where it has no word."""
     robot, q = Robot.load("kuka_kr270"), constrained.configurations
-    assert constrained.status == "ok"
+    assert constrained.quality.status == "ok"
     assert len(q) == 6
     low, high = robot.joint_limits.T
     assert ((low <= q) & (q <= high)).all() and (np.abs(q[:, [3, 5]]) <= np.pi).all() and (q[:, 0] < 1.5).all()
@@ -375,9 +375,9 @@ def test_the_bound_holds_for_feasible_plans(constrained):
     for rows in feasible.sample(rng, 6 * 300).reshape(300, 6, 6):
         stacked = robot.jacobian(rows).reshape(-1, 9)
         values.append(3e-5 * np.sqrt(np.trace(j0 @ np.linalg.pinv(stacked.T @ stacked) @ j0.T)))
-    assert constrained.lower_bound <= constrained.predicted_accuracy < min(values)
+    assert constrained.quality.lower_bound <= constrained.quality.predicted_accuracy < min(values)
     unconstrained = plan(PlanProblem(robot, TEST_POSE, 6, search=Search(starts=8)))
-    assert unconstrained.quality.lower_bound <= constrained.lower_bound * (1 + 1e-2)
+    assert unconstrained.quality.lower_bound <= constrained.quality.lower_bound * (1 + 1e-2)
 
 
 def test_the_order_of_visit_is_the_shorter_one(constrained):

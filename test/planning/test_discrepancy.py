@@ -11,12 +11,8 @@ from robots import SHARED_DATA, mixed, random_configurations
 from calib_planner import Robot
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning import Candidates, ModelDiscrepancy, PlanProblem, plan
-from calib_planner.planning.search.prediction import (
-    PredictionModel,
-    PredictionProblem,
-    choose_for_prediction,
-    prediction_problem,
-)
+from calib_planner.planning.discrepancy import PredictionModel, PredictionProblem, choose_for_prediction
+from calib_planner.planning.planner import prediction_problem
 
 WIDE = ModelDiscrepancy(joint_sigma=1e-3, joint_length=0.8, slide_sigma=4e-4, slide_length=0.5, point_sigma=2e-4)
 
@@ -165,7 +161,7 @@ def test_bad_values() -> None:
     with pytest.raises(InputError, match="point_sigma"):
         ModelDiscrepancy(point_sigma=-1.0)
     problem = request(mixed(), 3)
-    vars(problem)["pool"] = problem.candidates[:2]
+    vars(problem)["candidates"] = problem.candidates[:2]
     with pytest.raises(InfeasibleError, match="2 feasible rows"):
         choose_for_prediction(problem)
 

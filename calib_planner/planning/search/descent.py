@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, IntArray
-from calib_planner.planning.criteria import Criterion
+from calib_planner.planning.criteria import Criterion, log_values, ridged
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.information import InformationModel
 
@@ -229,7 +229,7 @@ def wander(
     q = start.copy()
     unit = model.at(q)
     matrix = unit.sum(axis=0) + prior
-    log_value = _log_values(criterion, matrix[None])[0]
+    log_value = log_values(criterion, ridged(matrix[None]))[0]
     marks, evaluations = [log_value], 0
     for _ in range(sweeps):
         if cancel() or (len(marks) > 5 and marks[-1] - marks[-6] < gain):
@@ -240,7 +240,7 @@ def wander(
             mine = np.flatnonzero(origin == row)
             if not mine.size:
                 continue
-            psis = _log_values(criterion, matrix - unit[row] + trial_unit[mine])
+            psis = log_values(criterion, ridged(matrix - unit[row] + trial_unit[mine]))
             evaluations += len(mine)
             best = int(np.argmax(psis))
             if psis[best] > log_value:
@@ -271,11 +271,3 @@ def climb(
         higher = order[values[order] > best[origin[order]]]
         q[origin[higher]], best[origin[higher]] = trial[higher], values[higher]
     return q, best
-
-
-def _log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
-    diagonal = np.einsum("spp->sp", matrices)
-    floor = 1e-12 * diagonal.mean(axis=1)[:, None, None] * np.eye(matrices.shape[-1])
-    psi = criterion.value_and_gradient(matrices + floor)[0]
-    usable = np.isfinite(psi) & (psi > 0)
-    return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)

@@ -31,11 +31,12 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning.criteria import Criterion, Determinant, Eliminating
+from calib_planner.planning.criteria import Criterion, Determinant, Eliminating, log_values
 from calib_planner.robot import analyse
 
 RIDGE = 1e-9
-"""Share of the candidates' mean information that is always added; it moves log det M by about p·RIDGE."""
+"""Share of the candidates' mean information that is always added: M stays invertible while rows are out, and
+log det M moves by about p·RIDGE."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +183,7 @@ def choose(
     for start in _starts(problem, rng):
         count += 1
         rows, tried = search.run(start, cancel)
-        log_value = _log_value(problem, rows)
+        log_value = float(_log_values(problem, _information(problem, rows)[None])[0])
         evaluations += tried
         if best is None or log_value > best.log_value:
             best = Choice(rows, log_value, 0)
@@ -236,17 +237,10 @@ def _information(problem: ChoiceProblem, rows: IntArray) -> FloatArray:
     return problem.prior + own.T @ own
 
 
-def _log_value(problem: ChoiceProblem, rows: IntArray) -> float:
-    psi = float(_values(problem.criterion, _information(problem, rows)[None])[0])
-    return float(np.log(psi)) if psi > 0 else -np.inf
-
-
-def _values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
-    """Ψ (S,), with so small a ridge that a singular matrix has a small value, not zero."""
+def _log_values(problem: ChoiceProblem, matrices: FloatArray) -> FloatArray:
+    """log Ψ (S,); the ridge is relative to each diagonal element, since rows may be in any units."""
     diagonal = np.einsum("sii->si", matrices)
-    floor = 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1])
-    psi = criterion.value_and_gradient(matrices + floor)[0]
-    return np.where(np.isfinite(psi), psi, 0.0)
+    return log_values(problem.criterion, matrices + 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1]))
 
 
 class _Search:
@@ -331,7 +325,7 @@ class _Shortlisted(_Search):
     def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         problem, rows = self.problem, self._greedy(start)
         matrix = _information(problem, rows)
-        psi = float(_values(problem.criterion, matrix[None])[0])
+        log_value = float(_log_values(problem, matrix[None])[0])
         tried = 1
         for _ in range(MOST_PASSES):
             improved = False
@@ -342,11 +336,11 @@ class _Shortlisted(_Search):
                 candidates = self._shortlist(matrix, rows)
                 if not candidates.size:
                     continue
-                trial = _values(problem.criterion, without + self._unit(candidates))
+                trial = _log_values(problem, without + self._unit(candidates))
                 tried += len(candidates)
                 best = int(np.argmax(trial))
-                if trial[best] > psi * (1.0 + 1e-9):
-                    rows[position], psi, improved = candidates[best], float(trial[best]), True
+                if trial[best] > log_value + 1e-9:
+                    rows[position], log_value, improved = candidates[best], float(trial[best]), True
                     matrix = _information(problem, rows)
             if not improved:
                 break

@@ -22,13 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.planning.criteria import Criterion
+from calib_planner.planning.criteria import Criterion, ridged
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.information import InformationModel
 from calib_planner.planning.search.descent import Descent, Mend, Objective, descend, wander
 
-RIDGE = 1e-12
-"""Added to the information of a plan, relative to its diagonal, so that singular plans stay finite."""
 CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
 FINALISTS = 3
@@ -85,9 +83,7 @@ def plan_objective(problem: SearchProblem, size: int) -> Objective:
     def objective(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         q = rows.reshape(len(rows) * size, -1)
         info = problem.model.linearised(q)
-        matrix = info.sums(size) + problem.prior
-        diagonal = np.einsum("spp->sp", matrix)
-        diagonal += RIDGE * diagonal.mean(axis=1, keepdims=True)
+        matrix = ridged(info.sums(size) + problem.prior)
         psi, by_matrix = problem.criterion.value_and_gradient(matrix)
         usable = psi > 0
         safe = np.where(usable, psi, 1.0)
