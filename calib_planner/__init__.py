@@ -5,6 +5,8 @@
 
 Nothing here needs ROS; the nodes live in ``calib_planner.ros``. A name is imported from its room when it is first
 used, so that a program pays only for what it needs.
+
+The words of this package are explained in docs/glossary.md.
 """
 
 from typing import TYPE_CHECKING

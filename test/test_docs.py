@@ -90,6 +90,20 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not [t for t in targets if not (page.parent / t).exists()]
 
 
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_files_that_are_named_exist(page: Path) -> None:
+    """Every ``folder/file.py`` and ``folder/`` in backticks is in the repository, by the end of its path."""
+    text = page.read_text(encoding="utf-8")
+    folders = ("calib_planner", "paper", "test", "bench", "tools", "config", "docs", "launch", "msg_defs")
+    here = [p.relative_to(ROOT).as_posix() for f in folders for p in (ROOT / f).rglob("*")] + [
+        "setup.py",
+        *folders,
+    ]
+    readers = re.findall(r"<!-- file: ([^ >]+) -->", text)  # files for the reader's own cell
+    named_files = set(re.findall(r"`((?:\w+/)*\w+\.py|(?:\w+/)+)`", text)) - set(readers)
+    assert not [n for n in named_files if not any(f"/{p}".endswith(f"/{n.rstrip('/')}") for p in here)]
+
+
 def test_the_runner_sees_failures_and_wrong_output(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(

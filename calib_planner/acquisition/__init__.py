@@ -1,4 +1,7 @@
-"""From streams of joint states and tracker points to standstills: stamps, clocks and intake."""
+"""From streams of joint states and tracker points to standstills: stamps, clocks and intake.
+
+docs/glossary.md explains the words.
+"""
 
 from calib_planner.acquisition.clocks import Offset
 from calib_planner.acquisition.intake import (

@@ -1,4 +1,7 @@
-"""Measuring as long as it takes: plan, measure, identify, plan the rest from what was measured, validate."""
+"""Measuring as long as it takes: plan, measure, identify, plan the rest from what was measured, validate.
+
+docs/glossary.md explains the words.
+"""
 
 from calib_planner.campaign.decide import decide
 from calib_planner.campaign.finish import RULES

@@ -3,6 +3,8 @@
 ``main`` runs a command, ``parser`` is the parser of all commands. The other names are for commands of other
 packages, such as the paper's; they are imported when they are first used, so that ``--help`` does not pay for
 them.
+
+docs/glossary.md explains the words.
 """
 
 from typing import TYPE_CHECKING

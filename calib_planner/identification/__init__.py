@@ -1,4 +1,7 @@
-"""What the measurements say: a problem, the verb ``identify``, the estimate, its validation and verdict."""
+"""What the measurements say: a problem, the verb ``identify``, the estimate, its validation and verdict.
+
+docs/glossary.md explains the words.
+"""
 
 from calib_planner.identification.checks import FEWEST, SIGNIFICANT, check_units
 from calib_planner.identification.estimate import (

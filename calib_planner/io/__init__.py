@@ -1,6 +1,8 @@
 """Files in and out: robots, measurements, plans, estimates, priors, constraints, bags and stored campaigns.
 
 Importing this room teaches ``Robot.load`` to read files; every other file is imported when it is first used.
+
+docs/glossary.md explains the words.
 """
 
 from typing import TYPE_CHECKING

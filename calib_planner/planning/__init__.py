@@ -1,4 +1,7 @@
-"""Where to measure: a plan problem, the verb ``plan``, the plan, and how good it provably is."""
+"""Where to measure: a plan problem, the verb ``plan``, the plan, and how good it provably is.
+
+docs/glossary.md explains the words.
+"""
 
 from calib_planner.planning.budget import Split, plan_for_accuracy, split_budget
 from calib_planner.planning.certify.prove import PROOF_STATUS

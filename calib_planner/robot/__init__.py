@@ -1,5 +1,7 @@
 """The robot: a chain of elementary transforms with named parameters, its kinematics,
 and which of its parameters data can identify.
+
+docs/glossary.md explains the words.
 """
 
 from calib_planner.robot.capsules import Capsules, segments

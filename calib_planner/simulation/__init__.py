@@ -1,4 +1,7 @@
-"""The world we test in: a robot with hidden true parameters, a tracker with noise, and what goes wrong."""
+"""The world we test in: a robot with hidden true parameters, a tracker with noise, and what goes wrong.
+
+docs/glossary.md explains the words.
+"""
 
 from calib_planner.simulation.cell import (
     ANGLE_ERROR,

@@ -1,4 +1,7 @@
-"""The laser tracker: the covariance of a point that it measures, and what it can see from its station."""
+"""The laser tracker: the covariance of a point that it measures, and what it can see from its station.
+
+docs/glossary.md explains the words.
+"""
 
 from calib_planner.tracker.noise import Isotropic, LaserTracker, Noise, covariance_gradient
 from calib_planner.tracker.visibility import (
