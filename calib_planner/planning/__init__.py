@@ -38,4 +38,4 @@ from calib_planner.planning.problem import (
 from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
 from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlanQuality
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
-from calib_planner.planning.tour import DWELL, Pace, timetable, usual_pace, visiting_order
+from calib_planner.planning.tour import DWELL, PEAK, Pace, timetable, usual_pace, visiting_order

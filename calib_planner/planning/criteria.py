@@ -343,38 +343,14 @@ def log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
     return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)
 
 
-@dataclass(frozen=True)
-class Report:
-    """How a criterion's value is told to people.
-
-    Attributes:
-        unit: Unit of the value; empty where it depends on the parameters' units.
-        sense: ``"min"`` or ``"max"``: whether smaller or larger values are better.
-    """
-
-    unit: str
-    sense: str
-
-
-REPORTS = {
-    "test_pose": Report("m", "min"),
-    "worst_pose": Report("m", "min"),
-    "d": Report("", "max"),
-    "d_star": Report("", "max"),
-    "a": Report("", "min"),
-    "e": Report("", "max"),
-    "o1": Report("", "max"),
-    "o2": Report("1", "max"),
-    "o3": Report("", "max"),
-    "o4": Report("", "max"),
-    "o5": Report("", "max"),
-}
+MINIMISED = ("test_pose", "worst_pose", "a")
+"""Criteria whose reported value is the better the smaller it is."""
 
 
 def reported_value(name: str, psi: float, size: int, measurements: int) -> float:
     """The value of the table at the top for a value Ψ."""
     if psi <= 0:
-        return float("inf") if REPORTS[name].sense == "min" else 0.0
+        return float("inf") if name in MINIMISED else 0.0
     if name in ("test_pose", "worst_pose"):
         return float(psi**-0.5)
     if name == "a":

@@ -36,17 +36,9 @@ from calib_planner.robot import Robot
 from calib_planner.tracker import LaserTracker, Noise, distances, elevations, incidence_cosines
 
 HEAD = (
-    "criterion",
-    "status",
-    "message",
-    "sigma",
-    "predicted_accuracy",
-    "lower_bound",
-    "bound",
-    "efficiency",
-    "value",
-    "value_bound",
-)
+    "criterion", "status", "message", "sigma", "predicted_accuracy", "lower_bound", "bound", "efficiency",
+    "value", "value_bound",
+)  # fmt: skip
 """What the sheet repeats of the plan."""
 
 

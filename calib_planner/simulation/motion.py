@@ -16,11 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray, frozen
+from calib_planner.planning import PEAK
 
 NANO = 1_000_000_000
 
-PEAK = 1.875
-"""Largest value of ds/dτ."""
 BACK_OFF = 0.05
 """How far the robot backs off between two standstills at nearly the same place [rad | m]."""
 

@@ -1,0 +1,1 @@
+"""Searching plans: one algorithm a file."""

@@ -42,13 +42,11 @@ class Descent:
     Attributes:
         x: (rows, D) final points, inside the box.
         value: (rows,) final values.
-        iterations: Iterations done by the longest row.
         evaluations: Rows evaluated in all.
     """
 
     x: FloatArray
     value: FloatArray
-    iterations: int
     evaluations: int
 
 
@@ -110,7 +108,7 @@ def descend(
         value[live[moved]] = new_value[moved]
         idle[live] = np.where(moved & (drop > tolerance), 0, idle[live] + 1)
         live = live[~over & (idle[live] < 2)]
-    return Descent(x, value, done, evaluations)
+    return Descent(x, value, evaluations)
 
 
 def _direction(
@@ -185,15 +183,6 @@ LONGEST, SHORTEST = 0.5, 5e-4
 """Lengths of steps, drawn evenly in the logarithm, as shares of the joint ranges."""
 
 
-@dataclass(frozen=True, eq=False)
-class Wandered:
-    """Configurations (size, joints) after the steps, the log of their value, values computed."""
-
-    configurations: FloatArray
-    log_value: float
-    evaluations: int
-
-
 def feasible_steps(
     feasibility: Feasibility, q: FloatArray, rng: np.random.Generator, trials: int = TRIALS
 ) -> tuple[FloatArray, IntArray]:
@@ -224,8 +213,14 @@ def wander(
     *,
     sweeps: int = 40,
     gain: float = 2e-4,
-) -> Wandered:
-    """Improve the plan ``start`` (size, joints); ends when five sweeps gain less than ``gain`` in log value."""
+) -> tuple[FloatArray, int]:
+    """Improve the plan ``start`` (size, joints) [rad | m].
+
+    Ends when five sweeps gain less than ``gain`` in log value.
+
+    Returns:
+        (size, joints) the better plan, and the number of plans evaluated.
+    """
     q = start.copy()
     unit = model.at(q)
     matrix = unit.sum(axis=0) + prior
@@ -249,7 +244,7 @@ def wander(
                 q[row], unit[row] = trial[chosen], trial_unit[chosen]
         matrix = unit.sum(axis=0) + prior
         marks.append(log_value)
-    return Wandered(q, float(log_value), evaluations)
+    return q, evaluations
 
 
 def climb(

@@ -122,15 +122,17 @@ def _along_the_edge(
     row, value, work = final.x[best], float(final.value[best]), 0
     for _ in range(EDGE_ROUNDS):
         plan = row.reshape(size, -1)
-        moved = wander(problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel)
-        descended = _descend_from(problem, size, moved.configurations[None], cancel, 60, 1e-6)
-        work += moved.evaluations + descended.evaluations
+        moved, tried = wander(
+            problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel
+        )
+        descended = _descend_from(problem, size, moved[None], cancel, 60, 1e-6)
+        work += tried + descended.evaluations
         gained = value - float(descended.value[0])
         if gained > 0:
             row, value = descended.x[0], float(descended.value[0])
         if gained < 1e-3 or cancel():
             break
-    return Descent(row[None], np.array([value]), final.iterations, work), work
+    return Descent(row[None], np.array([value]), work), work
 
 
 def _starts(
@@ -198,7 +200,6 @@ def _descend_from(
     return Descent(
         np.concatenate([part.x for part in ended]),
         np.concatenate([part.value for part in ended]),
-        max(part.iterations for part in ended),
         sum(part.evaluations for part in ended),
     )
 
