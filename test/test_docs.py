@@ -30,7 +30,7 @@ def named(page: Path) -> str:
 def record_bag(folder: Path) -> None:
     """The recording that docs/real-robot-data.md reads: the UR10e of the examples before a tracker."""
     pytest.importorskip("rosbags")
-    sys.path.insert(0, str(ROOT / "test" / "files"))
+    sys.path.insert(0, str(ROOT / "test" / "io"))
     from bags import campaign, write_bag
 
     from calib_planner import Robot

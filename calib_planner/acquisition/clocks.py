@@ -66,7 +66,7 @@ class ClockOffsets:
     shortest: int
     _joints: deque[Interval] = field(default_factory=lambda: deque(maxlen=LATELY))
     _points: list[deque[Interval]] = field(default_factory=list)
-    _found: list[deque[tuple[int, int, Interval]]] = field(default_factory=list)  # (offset, doubt, joints) [ns]
+    _offsets: list[deque[tuple[int, int, Interval]]] = field(default_factory=list)  # (offset, doubt, joints) [ns]
 
     def __post_init__(self) -> None:
         self.clear()
@@ -75,30 +75,30 @@ class ClockOffsets:
         """Forget everything: a clock was set."""
         self._joints.clear()
         self._points = [deque(maxlen=LATELY) for _ in range(self.targets)]
-        self._found = [deque(maxlen=REMEMBERED) for _ in range(self.targets)]
+        self._offsets = [deque(maxlen=REMEMBERED) for _ in range(self.targets)]
 
-    def add_joints(self, start: int, stop: int) -> None:
-        """The joints were at rest from ``start`` to ``stop`` [ns]."""
-        if stop - start >= self.shortest:
-            self._joints.append((start, stop))
+    def add_joints(self, start: int, end: int) -> None:
+        """The joints were at rest from ``start`` to ``end`` [ns]."""
+        if end - start >= self.shortest:
+            self._joints.append((start, end))
             for k, points in enumerate(self._points):
-                if (found := self._nearest((start, stop), points)) is not None:
-                    self._note(k, (start, stop), found)
+                if (nearest := self._nearest((start, end), points)) is not None:
+                    self._note(k, (start, end), nearest)
 
-    def add_point(self, target: int, start: int, stop: int) -> None:
-        """A target, from 0, was at rest from ``start`` to ``stop`` [ns]."""
-        if stop - start >= self.shortest:
-            self._points[target].append((start, stop))
-            if (found := self._nearest((start, stop), self._joints)) is not None:
-                self._note(target, found, (start, stop))
+    def add_point(self, target: int, start: int, end: int) -> None:
+        """A target, from 0, was at rest from ``start`` to ``end`` [ns]."""
+        if end - start >= self.shortest:
+            self._points[target].append((start, end))
+            if (nearest := self._nearest((start, end), self._joints)) is not None:
+                self._note(target, nearest, (start, end))
 
     def offset(self, target: int) -> Offset | None:
         """The offset of a target, from 0; ``None`` as long as too little was seen."""
-        found = self._lately(target)
-        if len(found) < FEWEST:
+        lately = self._lately(target)
+        if len(lately) < FEWEST:
             return None
-        seconds, doubt = (median(values) / NANO for values in list(zip(*found, strict=True))[:2])
-        return Offset(seconds, doubt, len(found))
+        seconds, doubt = (median(values) / NANO for values in list(zip(*lately, strict=True))[:2])
+        return Offset(seconds, doubt, len(lately))
 
     def beyond(self, target: int, bound: float) -> list[Interval]:
         """Rests of the joints [ns] whose points had an offset beyond ``bound`` [s], once the offset itself is."""
@@ -108,7 +108,7 @@ class ClockOffsets:
         return [rest for offset, doubt, rest in self._lately(target) if abs(offset) - doubt > bound * NANO]
 
     def _lately(self, target: int) -> list[tuple[int, int, Interval]]:
-        return [f for f in self._found[target] if f[2] in self._joints]
+        return [f for f in self._offsets[target] if f[2] in self._joints]
 
     def _nearest(self, rest: Interval, others: deque[Interval]) -> Interval | None:
         """Which of the other stream's rests belongs to ``rest``."""
@@ -118,4 +118,4 @@ class ClockOffsets:
     def _note(self, target: int, joints: Interval, points: Interval) -> None:
         offset = (sum(points) - sum(joints)) // 2
         doubt = abs((points[1] - points[0]) - (joints[1] - joints[0])) // 2
-        self._found[target].append((offset, doubt, joints))
+        self._offsets[target].append((offset, doubt, joints))

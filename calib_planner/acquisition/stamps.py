@@ -113,8 +113,8 @@ class StampOrder(Generic[T]):
 
     def _set_back(self, stream: int) -> None:
         """Forget a stream's past: its clock was set back, or one stamp was far in the future."""
-        kept = [entry for entry in self._heap if entry[1] != stream]
-        self._state[stream] = _Stream(dropped=self._state[stream].dropped + len(self._heap) - len(kept))
-        self._heap = kept
+        others = [entry for entry in self._heap if entry[1] != stream]
+        self._state[stream] = _Stream(dropped=self._state[stream].dropped + len(self._heap) - len(others))
+        self._heap = others
         heapq.heapify(self._heap)
         self._frontier = None

@@ -34,7 +34,7 @@ NANO = 1_000_000_000
 MOST_SAMPLES = 20_000
 """Samples of one stream that a standstill holds at most."""
 IN_A_ROW = 50
-"""Unusable messages in a row that are worth a rejection of their own."""
+"""So many unusable messages in a row get a rejection of their own."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Standstill:
     """Means over an interval in which nothing moved. n joints, T targets.
 
     Attributes:
-        start, stop: Stamps of the interval [ns].
+        start, end: Stamps of the interval [ns].
         joints: (n,) mean positions [rad | m].
         points: (T, 3) mean points in the tracker's frame [m]; NaN where a target was not seen.
         std: (T,) standard deviation of one coordinate of the mean point, from the scatter of the samples
@@ -90,7 +90,7 @@ class Standstill:
     """
 
     start: int
-    stop: int
+    end: int
     joints: FloatArray
     points: FloatArray
     std: FloatArray
@@ -99,12 +99,12 @@ class Standstill:
     @property
     def duration(self) -> float:
         """Length of the interval [s]."""
-        return (self.stop - self.start) / NANO
+        return (self.end - self.start) / NANO
 
     @property
     def stamp(self) -> int:
         """Middle of the interval [ns]."""
-        return (self.start + self.stop) // 2
+        return (self.start + self.end) // 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ class Rejection:
     """A standstill that cannot be used.
 
     Attributes:
-        start, stop: Stamps of the interval [ns].
+        start, end: Stamps of the interval [ns].
         reason: Which of the known ones.
         message: In words, with numbers and what to do.
         joints: (n,) last positions [rad | m], NaN if there were none.
@@ -120,7 +120,7 @@ class Rejection:
     """
 
     start: int
-    stop: int
+    end: int
     reason: Reason
     message: str
     joints: FloatArray
@@ -271,48 +271,48 @@ class StandstillDetector:
         begin = joints.since + _ns(s.settle)
         if self._measured is not None or not joints.samples or stamp - begin < _ns(s.duration):
             return []
-        stop = min(stamp, joints.last)
-        if all(len(w.samples) >= s.samples and stop - w.last <= w.gap for w in self._targets):
+        end = min(stamp, joints.last)
+        if all(len(w.samples) >= s.samples and end - w.last <= w.gap for w in self._targets):
             start = max(begin, *(w.settled(_ns(s.settle)) for w in self._targets))
-            if stop - start >= _ns(s.duration):
-                found = self._average(start, stop, s.samples)
-                if found is not None and (found.samples >= s.samples).all():
-                    return self._take(found)
-        if stop - begin < _ns(s.patience) or self._complained:
+            if end - start >= _ns(s.duration):
+                standstill = self._average(start, end, s.samples)
+                if standstill is not None and (standstill.samples >= s.samples).all():
+                    return self._take(standstill)
+        if end - begin < _ns(s.patience) or self._complained:
             return []
-        return self._what_there_is(begin, stop)
+        return self._what_there_is(begin, end)
 
     def _ended(self) -> list[Standstill | Rejection]:
-        """The joints moved on: what the standstill gives, if it was worth the name."""
-        begin, stop = self._joints.since + _ns(self.settings.settle), self._joints.last
-        brief = stop - begin < _ns(self.settings.duration) // 2
+        """The joints moved on: the standstill's result, if it was long enough to be one."""
+        begin, end = self._joints.since + _ns(self.settings.settle), self._joints.last
+        brief = end - begin < _ns(self.settings.duration) // 2
         if self._measured is not None or not self._joints.samples or brief or self._complained:
             return []
-        return self._what_there_is(begin, stop)
+        return self._what_there_is(begin, end)
 
-    def _what_there_is(self, begin: int, stop: int) -> list[Standstill | Rejection]:
+    def _what_there_is(self, begin: int, end: int) -> list[Standstill | Rejection]:
         least, settle = self.settings.minimum_samples, _ns(self.settings.settle)
         starts = [max(begin, w.settled(settle)) for w in self._targets if len(w.samples) >= least]
-        found = self._average(max(starts), stop, least) if starts else None
-        if found is not None and 2 * (found.stop - found.start) >= _ns(self.settings.duration):
-            return self._take(found)
+        standstill = self._average(max(starts), end, least) if starts else None
+        if standstill is not None and 2 * (standstill.end - standstill.start) >= _ns(self.settings.duration):
+            return self._take(standstill)
         self._complained = True
-        return [self._rejection(begin, stop, *self._why(begin, stop))]
+        return [self._rejection(begin, end, *self._why(begin, end))]
 
-    def _take(self, found: Standstill) -> list[Standstill | Rejection]:
-        self._measured = found.joints
+    def _take(self, standstill: Standstill) -> list[Standstill | Rejection]:
+        self._measured = standstill.joints
         self._rest = (self._joints.since, self._joints.last)
         self._joints.samples.clear()
-        return [found]
+        return [standstill]
 
-    def _average(self, start: int, stop: int, least: int) -> Standstill | None:
-        """Means over [start, stop] of the targets with at least ``least`` samples; None if there are none."""
-        q = self._joints.between(start, stop)
+    def _average(self, start: int, end: int, least: int) -> Standstill | None:
+        """Means over [start, end] of the targets with at least ``least`` samples; None if there are none."""
+        q = self._joints.between(start, end)
         points = np.full((self.target_count, 3), np.nan)
         std = np.full(self.target_count, np.nan)
         samples = np.zeros(self.target_count, np.int64)
         for k, window in enumerate(self._targets):
-            rows = window.between(start, stop)
+            rows = window.between(start, end)
             if len(rows) < least:
                 continue
             points[k], samples[k] = rows.mean(axis=0), len(rows)
@@ -320,9 +320,9 @@ class StandstillDetector:
                 std[k] = np.sqrt(rows.var(axis=0, ddof=1).mean() / len(rows))
         if not len(q) or not samples.any():
             return None
-        return Standstill(start, stop, *map(frozen, (q.mean(axis=0), points, std, samples)))
+        return Standstill(start, end, *map(frozen, (q.mean(axis=0), points, std, samples)))
 
-    def _why(self, begin: int, stop: int) -> tuple[Reason, str]:
+    def _why(self, begin: int, end: int) -> tuple[Reason, str]:
         moved = [w.moved_by for w in self._targets]
         if max(moved) > 0:
             k = int(np.argmax(moved))
@@ -330,23 +330,23 @@ class StandstillDetector:
             return Reason.MOVED, f"{text}: wait until nothing vibrates, or raise point_tolerance"
         if self._saw_nan:
             return Reason.NOT_FINITE, "values are not finite: check line of sight and the drivers"
-        if stop - begin < _ns(self.settings.duration):
+        if end - begin < _ns(self.settings.duration):
             return (
                 Reason.MOVED,
-                f"the robot moved on {(stop - begin) / NANO:.2f} s after settling: dwell longer",
+                f"the robot moved on {(end - begin) / NANO:.2f} s after settling: dwell longer",
             )
         behind = next((k for k in range(1, 1 + self.target_count) if self._lags(k)), None)
         if behind is not None:
             return Reason.TIME_SKEW, self._lag_text(behind)
-        s, most = self.settings, max(len(w.between(begin, stop)) for w in self._targets)
-        text = f"{most} points in {(stop - begin) / NANO:.2f} s without a pause over {s.gap:g} s"
+        s, most = self.settings, max(len(w.between(begin, end)) for w in self._targets)
+        text = f"{most} points in {(end - begin) / NANO:.2f} s without a pause over {s.gap:g} s"
         text += f", at least {s.minimum_samples} needed"
         return Reason.TOO_FEW_SAMPLES, f"{text}: check the tracker, its topic and its rate, or dwell longer"
 
-    def _rejection(self, start: int, stop: int, reason: Reason, message: str) -> Rejection:
+    def _rejection(self, start: int, end: int, reason: Reason, message: str) -> Rejection:
         last = self._joints.samples[-1][1] if self._joints.samples else np.full(self.joint_count, np.nan)
-        samples = np.array([len(w.between(start, stop)) if w.samples else 0 for w in self._targets])
-        return Rejection(start, stop, reason, message, frozen(last), frozen(samples))
+        samples = np.array([len(w.between(start, end)) if w.samples else 0 for w in self._targets])
+        return Rejection(start, end, reason, message, frozen(last), frozen(samples))
 
 
 def _name(stream: int) -> str:
@@ -414,9 +414,9 @@ class RestWindow:
             self.samples.popleft()
         return ended
 
-    def between(self, start: int, stop: int) -> FloatArray:
-        """(samples, n) values with stamps in [start, stop]."""
-        rows = [v for t, v in self.samples if start <= t <= stop]
+    def between(self, start: int, end: int) -> FloatArray:
+        """(samples, n) values with stamps in [start, end]."""
+        rows = [v for t, v in self.samples if start <= t <= end]
         return np.array(rows).reshape(len(rows), len(self._low))
 
 
@@ -426,28 +426,30 @@ class RestWindow:
 # repeatability, how the reflector sits) is added in squares.
 
 
-def mean_std(found: Sequence[Standstill], sigma: float = 0.0, repeatability: float = 0.0) -> FloatArray | None:
+def mean_std(
+    standstills: Sequence[Standstill], sigma: float = 0.0, repeatability: float = 0.0
+) -> FloatArray | None:
     """(N, T, 3) standard deviation of each coordinate of the mean points [m], NaN where a target was not seen.
 
     Args:
-        found: N standstills of T targets, at least one.
+        standstills: N standstills of T targets, at least one.
         sigma: Standard deviation of one coordinate of one sample [m]; 0: from the samples' scatter.
         repeatability: Standard deviation that averaging does not reduce [m].
 
     Returns:
         ``None`` where it is not known: no scatter, or a single sample each.
     """
-    samples = np.array([f.samples for f in found])
-    sigma = sigma or scatter(found)
+    samples = np.array([f.samples for f in standstills])
+    sigma = sigma or scatter(standstills)
     with np.errstate(divide="ignore"):
         std = np.sqrt(sigma**2 / samples + repeatability**2)
     std = np.repeat(np.where(samples > 0, std, np.nan)[:, :, None], 3, axis=2)
     return std if bool((std[samples > 0] > 0).all()) else None
 
 
-def scatter(found: Sequence[Standstill]) -> float:
+def scatter(standstills: Sequence[Standstill]) -> float:
     """Standard deviation of one coordinate of one sample [m], pooled; NaN free, 0 if unknown."""
-    freedom = np.array([np.maximum(f.samples - 1, 0) for f in found])
-    variance = np.array([f.std**2 * f.samples for f in found])
+    freedom = np.array([np.maximum(f.samples - 1, 0) for f in standstills])
+    variance = np.array([f.std**2 * f.samples for f in standstills])
     total = float(freedom.sum())
     return float(np.sqrt(np.nansum(freedom * variance) / total)) if total else 0.0

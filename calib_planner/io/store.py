@@ -112,7 +112,7 @@ class Record:
 
 def standstill_row(acquired: Standstill | Rejection, frame: str) -> dict[str, Any]:
     """The columns of a standstill."""
-    row: dict[str, Any] = {"start": acquired.start, "stop": acquired.stop, "joints": _text(acquired.joints)}
+    row: dict[str, Any] = {"start": acquired.start, "stop": acquired.end, "joints": _text(acquired.joints)}
     row |= {"samples": json.dumps(acquired.samples.tolist()), "frame": frame[:LONGEST]}
     if isinstance(acquired, Rejection):
         return row | {"rejected": acquired.reason.value, "message": acquired.message[:LONGEST]}
@@ -131,15 +131,15 @@ def record_of(path: str | Path, row: Mapping[str, Any], joints: int, targets: in
         return Node(path, f"{where}, {key}", json.loads(row[key])).array(shape, finite=False)
 
     try:
-        start, stop, q = int(row["start"]), int(row["stop"]), array("joints", joints)
+        start, end, q = int(row["start"]), int(row["stop"]), array("joints", joints)
         samples = frozen(np.array(json.loads(row["samples"]), np.int64))
         if samples.shape != (targets,):
             raise FileFormatError(path, f"{where}, samples", f"{samples.size} targets", f"{targets} targets")
         if row["rejected"] is not None:
             acquired: Standstill | Rejection
-            acquired = Rejection(start, stop, Reason(row["rejected"]), row["message"], q, samples)
+            acquired = Rejection(start, end, Reason(row["rejected"]), row["message"], q, samples)
         else:
-            acquired = Standstill(start, stop, q, array("points", targets, 3), array("std", targets), samples)
+            acquired = Standstill(start, end, q, array("points", targets, 3), array("std", targets), samples)
         decided = (row["status"], row["reason"], row["configuration"], row["repetition"])
         unused = tuple(json.loads(row["unused"]))
         return Record(acquired, *decided, unused, row["standstill"], row["frame"])

@@ -237,12 +237,12 @@ def measurement_message(
         joint_names=list(joint_names),
         joint_positions=found.joints.tolist(),
         samples=found.samples.tolist(),
-        duration=(found.stop - found.start) / NANO,
+        duration=(found.end - found.start) / NANO,
         status=MEASUREMENT_STATUS[status],
         unused_targets=list(unused),
         reason=reason,
     )
-    message.header.stamp = stamp_message((found.start + found.stop) // 2)
+    message.header.stamp = stamp_message((found.start + found.end) // 2)
     message.header.frame_id = frame_id
     if isinstance(found, Standstill):
         message.points = [Point(**_xyz(p)) for p in found.points]

@@ -169,11 +169,11 @@ class Itinerary:
 
     def begin(self, tour: Tour, stamp: int) -> None:
         """Send it on ``tour`` at ``stamp`` [ns]."""
-        self.stop(stamp)
+        self.halt(stamp)
         rest = self._leg
         self._leg = _Leg(stamp, rest.joints, rest.arrivals, None, tour)
 
-    def stop(self, stamp: int) -> None:
+    def halt(self, stamp: int) -> None:
         """It stands still where it is at ``stamp`` [ns], from then on."""
         here = self.at(np.array([stamp]))
         since = float(here.since[0])
@@ -184,8 +184,8 @@ class Itinerary:
         """Where it is at ``stamps`` (n,) [ns]."""
         leg = self._leg
         if leg.tour is not None:
-            found = leg.tour.stands((stamps - leg.began) / NANO)
-            return Stand(found.joints, found.arrival + leg.arrivals, found.since)
+            stand = leg.tour.stands((stamps - leg.began) / NANO)
+            return Stand(stand.joints, stand.arrival + leg.arrivals, stand.since)
         n = len(stamps)
         since = np.full(n, np.inf) if leg.arrived is None else (stamps - leg.arrived) / NANO
         return Stand(np.tile(leg.joints, (n, 1)), np.full(n, leg.arrivals - 1), since)

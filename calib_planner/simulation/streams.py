@@ -20,7 +20,7 @@ from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour
 from calib_planner.simulation.world import Sight, World
 
 LONGEST_STEP = 1.0
-"""Time that is made up for when nobody asked for longer; beyond that the streams begin anew [s]."""
+"""Time that is made up for when nobody read for longer; beyond that the streams begin anew [s]."""
 ANOTHER_DAY = 3600.0
 """A jump of the clock beyond which the simulation starts again [s]; so does one back."""
 PHASE = 0.37
@@ -57,11 +57,11 @@ class Rates:
 
 
 class Streams:
-    """Asked again and again for what has arrived.
+    """Read again and again for what has arrived.
 
     Args:
         world: Robot, tracker and faults.
-        where: Tells where the robot is at stamps (n,) [ns]; asked for the past only.
+        where: Tells where the robot is at stamps (n,) [ns]; only ever of the past.
         rates: Of the samples.
         start: When the simulation begins [ns].
     """
@@ -80,7 +80,7 @@ class Streams:
         self._begin(start)
 
     def advance(self, until: int) -> list[Message]:
-        """What arrives after the time asked for last, up to ``until`` [ns], in the order of arrival.
+        """What arrives after the last time read, up to ``until`` [ns], in the order of arrival.
 
         After a pause beyond ``LONGEST_STEP``, or a jump of the clock, the streams begin anew at ``until``.
         """
@@ -173,14 +173,16 @@ class _Post:
         on_time = times + _ns(delay + self._draw(Purpose.DELAY, len(times), jitter))
         on_time = np.maximum.accumulate(np.maximum(on_time, self.latest))
         self.latest = int(on_time[-1])
-        held = on_time + self._extra(Purpose.REORDER, Purpose.REORDER_DELAY, f.reorder_probability, len(times))
+        arrivals = on_time + self._extra(
+            Purpose.REORDER, Purpose.REORDER_DELAY, f.reorder_probability, len(times)
+        )
         again = self._extra(Purpose.DUPLICATE, Purpose.DUPLICATE_DELAY, f.duplicate_probability, len(times))
         sent = np.isfinite(values).all(axis=1)
         if self._stream and f.dropout_probability > 0:
             sent &= self._rng[Purpose.DROPOUT].random(len(times)) >= f.dropout_probability
         result = []
         for i in np.flatnonzero(sent):
-            result.append(Message(int(held[i]), self._stream, int(stamps[i]), values[i]))
+            result.append(Message(int(arrivals[i]), self._stream, int(stamps[i]), values[i]))
             if again[i] > 0:
                 result.append(Message(int(on_time[i] + again[i]), self._stream, int(stamps[i]), values[i]))
         return result

@@ -197,7 +197,7 @@ class Sight:
 
 
 class BeamBreaks:
-    """When the beam is broken, and how wrong distances are after each break; the list grows as it is asked."""
+    """When the beam is broken, and how wrong distances are after each break; the list grows as it is read."""
 
     def __init__(self, world: World) -> None:
         self._faults = world.faults

@@ -75,7 +75,7 @@ def test_one_result_per_standstill_and_honest_std() -> None:
         assert isinstance(found, Standstill)
         assert found.samples[0] >= 20 and 0.4 <= found.duration < 0.5
         assert found.std[0] == pytest.approx(SIGMA / np.sqrt(found.samples[0]), rel=0.4)
-        assert found.start < found.stamp < found.stop
+        assert found.start < found.stamp < found.end
 
 
 def test_results_are_immutable() -> None:
@@ -100,7 +100,7 @@ def test_disorder_and_duplicates_change_nothing() -> None:
     mixed = feed(StandstillDetector(2), late)
     assert len(plain) == len(mixed)
     for a, b in zip(plain, mixed, strict=True):
-        assert (a.start, a.stop) == (b.start, b.stop)
+        assert (a.start, a.end) == (b.start, b.end)
         assert isinstance(a, Standstill) and isinstance(b, Standstill)
         assert np.array_equal(a.points, b.points) and np.array_equal(a.joints, b.joints)
 
@@ -197,7 +197,7 @@ def test_clock_skew_is_said_again_and_again_but_not_each_time(offset: float) -> 
     messages = stream([*STOPS, *STOPS], offset=offset)
     live = sorted(messages, key=lambda m: m[0] - (offset * NANO if m[1] else 0))
     results = [r for r in feed(StandstillDetector(2), live, flush=False) if isinstance(r, Rejection)]
-    skew = [r for r in results if r.reason is Reason.TIME_SKEW and r.start == r.stop]
+    skew = [r for r in results if r.reason is Reason.TIME_SKEW and r.start == r.end]
     assert 4 <= len(skew) <= 6  # 12 s, and every 2 s after half a second or a whole one
     assert all("behind the others" in r.message for r in skew)
     # A standstill without points does not send anybody to look for the tracker.

@@ -62,7 +62,7 @@ def test_a_bag_gives_what_the_node_gives(tmp_path: Path, plugin: str, compressio
     expected = [s for s in as_the_node_does(SAID) if isinstance(s, Standstill)]
     assert len(found.data) == len(expected) == len(STOPS)
     for row, (mine, node) in enumerate(zip(found.standstills, expected, strict=True)):
-        assert (mine.start, mine.stop) == (node.start, node.stop)
+        assert (mine.start, mine.end) == (node.start, node.end)
         assert mine.joints.tobytes() == node.joints.tobytes() == found.data.q[row].tobytes()
         assert mine.points.tobytes() == node.points.tobytes() == found.data.p[row].tobytes()
     model = StoredModel(PLANAR.name, PLANAR.joint_names, len(PLANAR.targets), "")

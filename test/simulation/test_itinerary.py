@@ -43,7 +43,7 @@ def test_stopped_on_the_way_it_stands_there() -> None:
     walk.begin(tour, 0)
     moment = NANO // 3
     before = walk.at(np.array([moment]))
-    walk.stop(moment)
+    walk.halt(moment)
     later = walk.at(np.array([moment, 10 * moment]))
     assert np.array_equal(later.joints, np.repeat(before.joints, 2, axis=0))
     assert np.isinf(later.since).all() and (later.arrival == -1).all()
@@ -54,6 +54,6 @@ def test_stopped_at_rest_the_time_since_the_arrival_goes_on() -> None:
     tour = make_tour(np.zeros(2), Q[:1], np.array([1]), LIMITS, 4.0, 0.5)
     walk.begin(tour, 0)
     end = round(tour.seconds * NANO)
-    walk.stop(end)
+    walk.halt(end)
     found = walk.at(np.array([end, end + NANO]))
     assert np.allclose(found.since, [0.5, 1.5], atol=1e-8) and (found.arrival == 0).all()

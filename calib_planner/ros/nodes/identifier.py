@@ -92,7 +92,7 @@ class IdentifierOutput:
             )
             if not found.missing:
                 self._log().error(found.message)
-        message.header.stamp = stamp_message(campaign.kept[-1].acquired.stop if campaign.kept else 0)
+        message.header.stamp = stamp_message(campaign.kept[-1].acquired.end if campaign.kept else 0)
         self._estimates.publish(message)
 
     def description(self, urdf: str, found: Estimate | TooFew) -> None:
@@ -318,7 +318,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         rests = [] if campaign is None or intake is None else intake.misdated(bound)
         if campaign is None or intake is None or not rests:
             return
-        took = [(d, d.standstill.start, d.standstill.stop) for d in campaign.kept]
+        took = [(d, d.standstill.start, d.standstill.end) for d in campaign.kept]
         gone = [d for d, start, stop in took if any(a <= start and stop <= b for a, b in rests)]
         try:
             for decision in gone:

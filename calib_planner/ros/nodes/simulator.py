@@ -182,7 +182,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         self._watch(goal, execution, len(plan.configurations))
         with self._present:
             stopped = self._now()
-            self._itinerary.stop(stopped)
+            self._itinerary.halt(stopped)
         result.executed = tour.standstills(execution.seconds(stopped))
         if self._closing.is_set():
             return result
