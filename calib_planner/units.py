@@ -81,7 +81,7 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def listed(names: Iterable[object], most: int = 30, *, width: int = 200, none: str = "") -> str:
+def listed(names: Iterable[object], most: int = 30, *, width: int = 40, none: str = "") -> str:
     """``a, b, c and 5 more``: the first ``most`` names with commas between.
 
     Args:

@@ -1,10 +1,14 @@
 """Measurements out of a rosbag2 recording: joint states and tracker points, paired where the robot stood still.
 
-The decisions are the live node's: every message goes, in the order of recording, through the same
-``StandstillDetector`` with the same settings; only the stamps in the headers count. The bag is read as a stream.
-Every standstill is a row of its own, also if the robot was there before. Nothing is left out in silence: what
-took no part is counted by topic and reason, and a bag whose end cannot be read is refused, unless the part before
-is explicitly accepted.
+A bag is a folder with ``metadata.yaml``, a folder of storage files whose recorder never wrote that, or one
+storage file (.db3, .mcap). rosbags reads it, only the topics wanted and a chunk at a time; the types are
+those of ROS 2 Jazzy, whatever definitions the bag holds. Whatever rosbags raises on files that are no bags or
+are damaged becomes an error of ours.
+
+The live node and a bag decide alike: every message goes, in the order of recording, through the same intake
+with the same settings, and only the stamps in the headers count. Every standstill is a row of its own, also
+if the robot was there before. Every message that took no part is counted by topic and reason. A bag whose end
+cannot be read is refused, unless the part before is explicitly accepted.
 """
 
 from __future__ import annotations
@@ -35,8 +39,18 @@ from calib_planner.acquisition import (
 )
 from calib_planner.arrays import IntArray, check_number, frozen
 from calib_planner.errors import FileFormatError, InputError, MissingExtraError
+from calib_planner.io.text import user_path
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
+from calib_planner.units import cut, listed
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+POINT = "geometry_msgs/msg/PointStamped"
+STORAGE = (".db3", ".mcap")
+WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
+REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
+REPORT_EVERY = 2000
+"""Messages between two reports of progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +155,8 @@ def _check_streams(path: str | Path, streams: tuple[StreamCount, ...], joint_nam
     for points in streams[1:]:
         apart = max(points.first - joints.last, joints.first - points.last)
         if apart > 0:
-            got = " and ".join(
-                f"{s.name} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (joints, points)
-            )
+            spans = (f"{s.name} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (joints, points))
+            got = " and ".join(spans)
             advice = "synchronise the clocks (PTP or NTP) and record again, or correct the stamps"
             raise FileFormatError(path, "header stamps", got, "streams that overlap in time", advice)
 
@@ -172,10 +185,6 @@ def _reasons(rejections: list[Rejection] | tuple[Rejection, ...]) -> list[str]:
 
 def _seconds(stamp: int) -> str:
     return f"{stamp / NANO:.3f} s"
-
-
-REPORT_EVERY = 2000
-"""Messages between two reports of progress."""
 
 
 class _BagIntake:
@@ -209,9 +218,8 @@ class _BagIntake:
             stopped = f"unreadable after {done} messages: {error}"
         self._sort(self._detector.flush())
         damage = [recording.unread, stopped]
-        for count, dropped, promised in zip(
-            self.intake.streams, self._detector.dropped, recording.promised, strict=True
-        ):
+        counts = zip(self.intake.streams, self._detector.dropped, recording.promised, strict=True)
+        for count, dropped, promised in counts:
             if count.messages < promised and not stopped:
                 damage.append(f"{promised - count.messages} of {promised} messages of {count.name} are missing")
             if count.left_out[UNREADABLE]:
@@ -250,19 +258,7 @@ class _BagIntake:
                 self.rejections.append(result)
 
 
-# ── Messages out of a rosbag2 recording, one at a time, whatever its storage; rosbags does the reading ──────
-# A bag is a folder with ``metadata.yaml``, a folder of storage files whose recorder never wrote that, or one
-# storage file (.db3, .mcap). Only the topics asked for are read, and only a chunk at a time is in memory. Their
-# types are those of ROS 2 Jazzy, whatever definitions the bag holds or lacks. Whatever rosbags raises on files
-# that are no bags or are damaged becomes an error of ours.
-
-JOINT_STATE = "sensor_msgs/msg/JointState"
-POINT = "geometry_msgs/msg/PointStamped"
-STORAGE = (".db3", ".mcap")
-WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
-REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
-MOST_LISTED = 20
-"""Topics or files that an error lists."""
+# ── messages out of a recording ──────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True)
@@ -365,7 +361,7 @@ def open_bag(path: str | Path, topics: BagTopics) -> Iterator[Recording]:
 
 def is_bag(path: str | Path) -> bool:
     """Whether ``path`` is to be read as a bag rather than as text: a folder, or a storage file by its name."""
-    place = Path(path).expanduser()
+    place = user_path(path)
     return place.is_dir() or place.suffix in STORAGE or place.name == "metadata.yaml"
 
 
@@ -375,7 +371,7 @@ def storage_parts(path: str | Path) -> list[Path]:
     Raises:
         FileFormatError: There is nothing of the kind.
     """
-    place = Path(path).expanduser()
+    place = user_path(path)
     place = place.parent if place.name == "metadata.yaml" else place
     try:
         if not place.is_dir():
@@ -393,14 +389,13 @@ def storage_parts(path: str | Path) -> list[Path]:
     if found:
         return found
     inner = [p.name for p in files if (p / "metadata.yaml").is_file()]
-    advice = f"give one of the folders in it: {_cut(inner)}" if inner else "give the folder that ros2 bag wrote"
-    raise FileFormatError(path, "folder", f"{_cut([p.name for p in files])}", WHAT, advice)
+    advice = f"give one of the folders in it: {_list(inner)}" if inner else "give the folder that ros2 bag wrote"
+    raise FileFormatError(path, "folder", _list([p.name for p in files]), WHAT, advice)
 
 
 def reason(error: BaseException) -> str:
     """What went wrong in one line, short; the kind of error where it has no text."""
-    text = " ".join(str(error).split())[:300].rstrip(".")
-    return text or type(error).__name__
+    return cut(" ".join(str(error).split()), 300).rstrip(".") or type(error).__name__
 
 
 def _rosbags() -> tuple[Any, Any]:
@@ -417,26 +412,25 @@ def _check_topics(path: str | Path, readers: list[Any], names: tuple[str, ...]) 
     held: dict[str, set[str]] = {}
     for connection in (c for r in readers for c in r.connections):
         held.setdefault(connection.topic, set()).add(connection.msgtype)
-    described = _cut([f"{t} ({', '.join(sorted(held[t]))})" for t in sorted(held)])
+    described = _list([f"{t} ({', '.join(sorted(held[t]))})" for t in sorted(held)])
     for stream, name in enumerate(names):
         wanted, option = (POINT, "--point-topic") if stream else (JOINT_STATE, "--joint-topic")
         fitting = [t for t in sorted(held) if held[t] == {wanted}]
         close = (get_close_matches(name, fitting, n=1, cutoff=0.3) or fitting)[:1]
         advice = f"is it {option} {close[0]}?" if close else f"record a topic of type {wanted}"
         if name not in held:
-            raise FileFormatError(
-                path, f"topic {name}", f"a bag with {described}", f"messages of {wanted}", advice
-            )
+            got = f"a bag with {described}"
+            raise FileFormatError(path, f"topic {name}", got, f"messages of {wanted}", advice)
         if held[name] != {wanted}:
             raise FileFormatError(path, f"topic {name}", ", ".join(sorted(held[name])), wanted, advice)
 
 
 def _write_ahead(path: str | Path) -> str:
     """Names logs beside SQLite files that still hold messages: the recorder did not end properly."""
-    place = Path(path).expanduser()
+    place = user_path(path)
     logs = [place.with_name(place.name + "-wal")] if place.is_file() else sorted(place.glob("*.db3-wal"))
     full = [p.name for p in logs if p.is_file() and p.stat().st_size]
-    return f"{_cut(full)} holds messages not yet in the .db3 file (open that once with sqlite3)" if full else ""
+    return f"{_list(full)} holds messages not yet in the .db3 file (open that once with sqlite3)" if full else ""
 
 
 def _numbered(path: Path) -> list[Any]:
@@ -445,6 +439,6 @@ def _numbered(path: Path) -> list[Any]:
     return [int(w) if i % 2 else w for i, w in enumerate(words)]
 
 
-def _cut(names: list[str]) -> str:
-    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
-    return ", ".join(n[:200] for n in names[:MOST_LISTED]) + more if names else "nothing"
+def _list(names: list[str]) -> str:
+    """Topics or files, as many as an error shows."""
+    return listed(names, 20, width=200, none="nothing")

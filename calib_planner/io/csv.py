@@ -1,8 +1,16 @@
-"""A CSV file as a table of text that knows its lines, so that every error can name row and column.
+"""Tables of joint configurations and of measurements as CSV files.
 
-Comma, semicolon or tab separate the cells (the header decides); a byte order mark, CRLF, blank lines and
-lines that start with ``#`` are tolerated. Lines stay text until their numbers are asked for, a block at a time: a
-million rows take seconds and a few times the file's size.
+*A table* is text that knows its lines, so that every error can name row and column. Comma, semicolon or tab
+separate the cells (the header decides); a byte order mark, CRLF, blank lines and lines that start with ``#``
+are tolerated. Lines stay text until their numbers are read, a block at a time: a million rows take seconds
+and a few times the file's size.
+
+*Configurations* (candidates, test paths, plans to be measured) have a column per joint, in any order. A column
+``repetitions`` says how often each is to be measured; other columns are ignored.
+
+*Measurements* have the joint columns, ``x1,y1,z1[,x2…]`` and optionally ``std_x1,…``: a row per configuration,
+[rad | m] and [m] in the tracker's frame. Empty cells: the target was not measured. Other columns are ignored,
+unless their name is nearly one of these.
 """
 
 from __future__ import annotations
@@ -25,14 +33,20 @@ from calib_planner.errors import FileFormatError
 from calib_planner.io.text import read_text, write_text
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
+from calib_planner.units import brief, listed
 
 MAX_ROWS = 1_000_000
 MAX_COLUMNS = 10_000
 BLOCK = 10_000
 """Rows turned into numbers at a time."""
-MOST_LISTED = 30
-"""Column names that an error lists."""
 LINE_END = re.compile(r"\r\n|\r|\n")
+CONFIGURATIONS = "a CSV of joint configurations"
+MEASUREMENTS = "a CSV of measurements"
+REPETITIONS = "repetitions"
+COORDINATE = re.compile(r"(std_)?([xyz])([1-9][0-9]{0,3})")
+NEARLY = re.compile(r"(std|sigma)?[_ ]*[xyz][_ ]*[0-9]*", re.IGNORECASE)
+
+# ── tables ───────────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +91,9 @@ class Table:
     def _careful_numbers(
         self, start: int, block: Sequence[str], names: Sequence[str], at: list[int], empty: bool
     ) -> list[list[float]]:
+        rows = enumerate((_cells(s, self.mark) for s in block), start)
         return [
-            [self._number(start + i, n, cells[j], empty) for n, j in zip(names, at, strict=True)]
-            for i, cells in enumerate(_cells(s, self.mark) for s in block)
+            [self._number(i, n, cells[j], empty) for n, j in zip(names, at, strict=True)] for i, cells in rows
         ]
 
     def _number(self, row: int, column: str, cell: str, empty: bool) -> float:
@@ -94,7 +108,7 @@ class Table:
         if not math.isfinite(value):
             hint = "leave the cell empty where nothing was measured" if empty else ""
             hint = "use a decimal point" if "," in cell else hint
-            raise self.error(row, column, repr(cell[:40]), "a finite number", hint)
+            raise self.error(row, column, brief(cell, 40), "a finite number", hint)
         return value
 
 
@@ -110,12 +124,11 @@ def read_table(path: str | Path, what: str) -> Table:
     mark = max(",;\t", key=rows[0].count)
     header = _cells_or_error(path, lines[0], rows[0], mark, what)
     if len(header) > MAX_COLUMNS:
-        raise FileFormatError(
-            path, "header", f"{len(header)} columns", f"at most {MAX_COLUMNS}", "leave some out"
-        )
+        got = f"{len(header)} columns"
+        raise FileFormatError(path, "header", got, f"at most {MAX_COLUMNS}", "leave some out")
     doubled = sorted(n for n, count in Counter(header).items() if count > 1 and n)
     if doubled:
-        raise FileFormatError(path, "header", f"{shown(doubled)} twice", "each column name once")
+        raise FileFormatError(path, "header", f"{listed(doubled)} twice", "each column name once")
     body, numbers = [], []
     for line, text in zip(lines[1:], rows[1:], strict=True):
         count = len(_cells_or_error(path, line, text, mark, what)) if '"' in text else text.count(mark) + 1
@@ -146,15 +159,8 @@ def require_columns(table: Table, names: Sequence[str], what: str) -> None:
     others = {c.casefold(): c for c in table.columns if c not in wanted and len(c) <= 100}
     close = get_close_matches(missing[0].casefold(), others, n=1)
     advice = f"is {others[close[0]]!r} meant to be {missing[0]!r}?" if close else "rename or add them"
-    got = f"no column {shown(missing)} among {shown(table.columns)}"
-    raise FileFormatError(table.path, "header", got, f"{what} {shown(names)}", advice)
-
-
-def shown(names: Sequence[str]) -> str:
-    """Names with commas between, cut to what an error line can hold and to what a terminal can show."""
-    short = [n[:40] if n.isprintable() else ascii(n[:40]) for n in names[:MOST_LISTED]]
-    more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
-    return ", ".join(short) + more
+    got = f"no column {listed(missing)} among {listed(table.columns)}"
+    raise FileFormatError(table.path, "header", got, f"{what} {listed(names)}", advice)
 
 
 def format_table(columns: Sequence[str], rows: Sequence[Sequence[float]]) -> str:
@@ -169,14 +175,11 @@ def _filled_lines(path: str | Path, text: str) -> tuple[list[int], list[str]]:
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
         raise FileFormatError(path, f"line {line}", "a NUL character", "text", "save it as UTF-8, not UTF-16")
-    kept = [(i, s) for i, s in enumerate(_lines(text), 1) if s and not s.isspace() and s.lstrip()[0] != "#"]
-    if len(kept) > MAX_ROWS + 1:
-        raise FileFormatError(path, "rows", len(kept) - 1, f"at most {MAX_ROWS}", "split the file")
-    return [i for i, _ in kept], [s for _, s in kept]
-
-
-def _lines(text: str) -> list[str]:
-    return text.split("\n") if "\r" not in text else LINE_END.split(text)
+    lines = text.split("\n") if "\r" not in text else LINE_END.split(text)
+    filled = [(i, s) for i, s in enumerate(lines, 1) if s and not s.isspace() and s.lstrip()[0] != "#"]
+    if len(filled) > MAX_ROWS + 1:
+        raise FileFormatError(path, "rows", len(filled) - 1, f"at most {MAX_ROWS}", "split the file")
+    return [i for i, _ in filled], [s for _, s in filled]
 
 
 def _cells(text: str, mark: str) -> list[str]:
@@ -189,9 +192,8 @@ def _cells_or_error(path: str | Path, line: int, text: str, mark: str, what: str
     try:
         return _cells(text, mark)
     except csv.Error as error:
-        raise FileFormatError(
-            path, f"text of line {line}", error, what, "quotes enclose whole cells and end on their line"
-        ) from None
+        advice = "quotes enclose whole cells and end on their line"
+        raise FileFormatError(path, f"text of line {line}", error, what, advice) from None
 
 
 def _plain_numbers(block: Sequence[str], mark: str, at: list[int]) -> FloatArray:
@@ -210,11 +212,7 @@ def _plain_numbers(block: Sequence[str], mark: str, at: list[int]) -> FloatArray
     return values
 
 
-# ── Joint configurations as CSV: candidates, test paths, plans to be measured. Joint columns in any order ───
-# A column ``repetitions`` says how often each is to be measured; other columns are ignored.
-
-CONFIGURATIONS = "a CSV of joint configurations"
-REPETITIONS = "repetitions"
+# ── configurations ───────────────────────────────────────────────────────────────────────────────────
 
 
 def read_configurations(path: str | Path, robot: Robot, *, degrees: bool = False) -> FloatArray:
@@ -272,13 +270,7 @@ def angle_factors(robot: Robot, *, degrees: bool) -> FloatArray:
     return np.where(robot.joint_is_revolute & degrees, np.pi / 180.0, 1.0)
 
 
-# ── Measurements as CSV: joint columns in any order, ``x1,y1,z1[,x2…]`` and optionally ``std_x1,…`` ─────────
-# One row per configuration, [rad | m] and [m] in the tracker's frame; empty cells: target not measured. Other
-# columns are ignored, unless their name is nearly one of these.
-
-MEASUREMENTS = "a CSV of measurements"
-COORDINATE = re.compile(r"(std_)?([xyz])([1-9][0-9]{0,3})")
-NEARLY = re.compile(r"(std|sigma)?[_ ]*[xyz][_ ]*[0-9]*", re.IGNORECASE)
+# ── measurements ─────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,8 +309,8 @@ def read_measurements(path: str | Path, robot: Robot, *, degrees: bool = False) 
     ignored = tuple(c for c in table.columns if c not in known)
     for name in ignored:
         if NEARLY.fullmatch(name):
-            valid = f"{shown(_names(count, ''))} and std_ of each"
-            raise FileFormatError(path, f"column {name[:40]!r}", "an unknown name", valid, "rename it")
+            valid = f"{listed(_names(count, ''))} and std_ of each"
+            raise FileFormatError(path, f"column {brief(name, 40)}", "an unknown name", valid, "rename it")
     return MeasurementFile(Measurements(robot.joint_names, q, points, std), ignored, table.lines)
 
 

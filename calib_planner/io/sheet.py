@@ -1,8 +1,18 @@
-"""Plan sheets as CSV and YAML, exact to the bit.
+"""Plan sheets as CSV, YAML and trajectory, exact to the bit.
 
-The CSV has a row per stop. Joint columns bear the joints' own names and are in rad or m, and there is a column
+*The CSV* has a row per visit. Joint columns bear the joints' own names and are in rad or m, and there is a column
 ``repetitions``: whatever reads a plan from a CSV reads the sheet. ``<joint>_deg`` and ``<joint>_mm`` repeat them
-for people. Empty cells are not known; ``not checked`` says so. The YAML holds ``PlanSheet.to_dict``.
+for people. Empty cells are not known; ``not checked`` says so.
+
+*The YAML* holds ``PlanSheet.to_dict``: numbers that are not known are ``.nan``, what was not checked is ``null``.
+
+*The trajectory* is the YAML of one trajectory_msgs/msg/JointTrajectory with every field, as ``ros2 topic echo``
+prints it and ``ros2 topic pub`` takes it:
+
+    ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat trajectory.yaml)"
+
+The robot arrives at every visit at rest and stands for its measurements: two points per visit, or one if the
+standstill has no length. Between the points a controller interpolates; nobody has checked what is in its way.
 """
 
 from __future__ import annotations
@@ -55,7 +65,7 @@ def write_sheet_yaml(path: str | Path, sheet: PlanSheet, field: str = "output") 
 
 
 def write_sheet_csv(path: str | Path, sheet: PlanSheet, field: str = "output") -> None:
-    """Write the stops.
+    """Write the visits.
 
     Raises:
         InputError: The path cannot be written; or a joint has the name of another column.
@@ -114,14 +124,6 @@ def _cell(value: Any) -> str:
     return "" if math.isnan(value) else repr(float(value))
 
 
-# ── A plan sheet as the YAML of one trajectory_msgs/msg/JointTrajectory, every field of it ──────────────────
-# It is what ``ros2 topic echo`` would print and what ``ros2 topic pub`` takes:
-#
-#     ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat trajectory.yaml)"
-#
-# The robot arrives at every stop at rest and stands for its measurements: two points per stop, or one if the
-# standstill has no length. Between the points a controller interpolates; nobody has checked what is in its way.
-
 NANO = 1_000_000_000
 
 
@@ -129,7 +131,7 @@ def write_trajectory(path: str | Path, sheet: PlanSheet, field: str = "output") 
     """Write the trajectory [rad | m, s].
 
     Raises:
-        InfeasibleError: A stop is not reachable: nothing is written that a robot could be sent to.
+        InfeasibleError: A configuration is not reachable: nothing is written that a robot could be sent to.
         InputError: The path cannot be written; names ``field``.
     """
     write_text(path, trajectory_text(sheet), field)
@@ -150,7 +152,7 @@ def trajectory(sheet: PlanSheet) -> dict[str, Any]:
     """The message as a mapping, fields in the order of their definition.
 
     Raises:
-        InfeasibleError: A stop is not reachable; names it and what it breaks.
+        InfeasibleError: A configuration is not reachable; names its visit and what it breaks.
     """
     for i, broken in enumerate(sheet.checks.reach_breaks, 1):
         if broken:
