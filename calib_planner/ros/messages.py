@@ -32,11 +32,9 @@ MOST_REPETITIONS = 100_000
 
 PLAN_STATUS = {
     "ok": PlanMessage.STATUS_OK,
-    "not_converged": PlanMessage.STATUS_NOT_CONVERGED,
     "time_limit": PlanMessage.STATUS_TIME_LIMIT,
     "cancelled": PlanMessage.STATUS_CANCELLED,
     "singular": PlanMessage.STATUS_SINGULAR,
-    "infeasible": PlanMessage.STATUS_INFEASIBLE,
     "empty": PlanMessage.STATUS_EMPTY,
 }
 ESTIMATE_STATUS = {
@@ -44,7 +42,6 @@ ESTIMATE_STATUS = {
     "too_few": CalibrationEstimate.STATUS_TOO_FEW_MEASUREMENTS,
     "rank_deficient": CalibrationEstimate.STATUS_RANK_DEFICIENT,
     "not_converged": CalibrationEstimate.STATUS_NOT_CONVERGED,
-    "poor_fit": CalibrationEstimate.STATUS_POOR_FIT,
     "error": CalibrationEstimate.STATUS_ERROR,
 }
 MEASUREMENT_STATUS = {
@@ -56,7 +53,6 @@ MEASUREMENT_STATUS = {
     Reason.NOT_FINITE.value: Measurement.REJECTED_NOT_FINITE,
     "not_in_plan": Measurement.REJECTED_NOT_IN_PLAN,
     "outlier": Measurement.REJECTED_OUTLIER,
-    "bad_joints": Measurement.REJECTED_BAD_JOINTS,
     "undone": Measurement.REJECTED_UNDONE,
     "not_stored": Measurement.REJECTED_NOT_STORED,
     "clock_offset": Measurement.REJECTED_CLOCK_OFFSET,
@@ -134,7 +130,7 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
         raise InputError("repetitions", brief(counts.tolist()), expected)
     names = {v: k for k, v in PLAN_STATUS.items()}
     status = names.get(message.status, "")
-    if status in ("", "empty", "infeasible"):
+    if status in ("", "empty"):
         raise InputError("status", status or message.status, "a plan that can be executed")
     accuracy = np.asarray(message.predicted_accuracy_per_test_pose, float)
     if accuracy.shape != (len(poses),):
