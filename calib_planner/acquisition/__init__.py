@@ -17,8 +17,9 @@ from calib_planner.acquisition.intake import (
 from calib_planner.acquisition.standstill import (
     IN_A_ROW,
     NANO,
-    Reason,
+    REJECTIONS,
     Rejection,
+    RejectionReason,
     Standstill,
     StandstillDetector,
     StandstillSettings,

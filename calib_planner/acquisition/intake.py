@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from calib_planner.acquisition.clocks import NANO
 from calib_planner.acquisition.standstill import (
     IN_A_ROW,
-    Reason,
     Rejection,
+    RejectionReason,
     Standstill,
     StandstillDetector,
     StandstillSettings,
@@ -249,7 +249,7 @@ class Intake:
         text = next(filter(None, self._other_frame), "") if results else ""
         if not text:
             return results
-        named = {"reason": Reason.OTHER_FRAME, "message": text}
+        named = {"reason": RejectionReason.OTHER_FRAME, "message": text}
         return [replace(r, **named) if isinstance(r, Rejection) else r for r in results]  # type: ignore[arg-type]
 
     def offset_text(self, bound: float) -> str:

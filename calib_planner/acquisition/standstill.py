@@ -66,7 +66,7 @@ class StandstillSettings:
             raise InputError("minimum_samples", self.minimum_samples, f"at most samples = {self.samples}")
 
 
-class Reason(Enum):
+class RejectionReason(Enum):
     """Why a standstill gave no measurement."""
 
     MOVED = "moved"
@@ -74,6 +74,16 @@ class Reason(Enum):
     TIME_SKEW = "time_skew"
     OTHER_FRAME = "other_frame"
     NOT_FINITE = "not_finite"
+
+
+REJECTIONS = {
+    RejectionReason.MOVED.value: "The robot or a target moved. Wait until it stands still, measure again.",
+    RejectionReason.TOO_FEW_SAMPLES.value: "The standstill was too short. Dwell longer, or raise the rate.",
+    RejectionReason.TIME_SKEW.value: "The stamps of joints and tracker do not overlap. Synchronise the clocks.",
+    RejectionReason.OTHER_FRAME.value: "Points came in another frame_id than before. Publish all in one frame.",
+    RejectionReason.NOT_FINITE.value: "Values are not finite. Check line of sight and the drivers.",
+}
+"""Value of a ``RejectionReason`` → what it means and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +131,7 @@ class Rejection:
 
     start: int
     end: int
-    reason: Reason
+    reason: RejectionReason
     message: str
     joints: FloatArray
     samples: IntArray
@@ -201,13 +211,15 @@ class StandstillDetector:
             text = f"{self._nan_in_a_row[stream]} messages in a row from {_name(stream)} are not finite"
             text += ": check line of sight and driver"
             bad = self._nan_in_a_row[stream] >= IN_A_ROW
-            return self._complaint(stream, stamp, Reason.NOT_FINITE, text) if bad else []
+            return self._complaint(stream, stamp, RejectionReason.NOT_FINITE, text) if bad else []
         self._nan_in_a_row[stream] = 0
         if not self._order.add(stream, stamp, value) and self._lags(stream):
-            return self._complaint(stream, stamp, Reason.TIME_SKEW, self._lag_text(stream))
+            return self._complaint(stream, stamp, RejectionReason.TIME_SKEW, self._lag_text(stream))
         return self._process()
 
-    def _complaint(self, stream: int, stamp: int, reason: Reason, text: str) -> list[Standstill | Rejection]:
+    def _complaint(
+        self, stream: int, stamp: int, reason: RejectionReason, text: str
+    ) -> list[Standstill | Rejection]:
         """A rejection about a stream, as often as there could have been a standstill."""
         before = self._complained_at[stream]
         if before <= stamp <= before + _ns(self.settings.patience):
@@ -322,28 +334,31 @@ class StandstillDetector:
             return None
         return Standstill(start, end, *map(frozen, (q.mean(axis=0), points, std, samples)))
 
-    def _why(self, begin: int, end: int) -> tuple[Reason, str]:
+    def _why(self, begin: int, end: int) -> tuple[RejectionReason, str]:
         moved = [w.moved_by for w in self._targets]
         if max(moved) > 0:
             k = int(np.argmax(moved))
             text = f"target {k + 1} moved by {length(moved[k])} while the joints stood still"
-            return Reason.MOVED, f"{text}: wait until nothing vibrates, or raise point_tolerance"
+            return RejectionReason.MOVED, f"{text}: wait until nothing vibrates, or raise point_tolerance"
         if self._saw_nan:
-            return Reason.NOT_FINITE, "values are not finite: check line of sight and the drivers"
+            return RejectionReason.NOT_FINITE, "values are not finite: check line of sight and the drivers"
         if end - begin < _ns(self.settings.duration):
             return (
-                Reason.MOVED,
+                RejectionReason.MOVED,
                 f"the robot moved on {(end - begin) / NANO:.2f} s after settling: dwell longer",
             )
         behind = next((k for k in range(1, 1 + self.target_count) if self._lags(k)), None)
         if behind is not None:
-            return Reason.TIME_SKEW, self._lag_text(behind)
+            return RejectionReason.TIME_SKEW, self._lag_text(behind)
         s, most = self.settings, max(len(w.between(begin, end)) for w in self._targets)
         text = f"{most} points in {(end - begin) / NANO:.2f} s without a pause over {s.gap:g} s"
         text += f", at least {s.minimum_samples} needed"
-        return Reason.TOO_FEW_SAMPLES, f"{text}: check the tracker, its topic and its rate, or dwell longer"
+        return (
+            RejectionReason.TOO_FEW_SAMPLES,
+            f"{text}: check the tracker, its topic and its rate, or dwell longer",
+        )
 
-    def _rejection(self, start: int, end: int, reason: Reason, message: str) -> Rejection:
+    def _rejection(self, start: int, end: int, reason: RejectionReason, message: str) -> Rejection:
         last = self._joints.samples[-1][1] if self._joints.samples else np.full(self.joint_count, np.nan)
         samples = np.array([len(w.between(start, end)) if w.samples else 0 for w in self._targets])
         return Rejection(start, end, reason, message, frozen(last), frozen(samples))

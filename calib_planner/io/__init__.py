@@ -39,8 +39,12 @@ if TYPE_CHECKING:
     from calib_planner.io.sources import Sources, SourceSettings, read_source, read_sources
     from calib_planner.io.store import (
         ACCEPTED,
+        CLOCK_OFFSET,
+        DECISIONS,
         KEPT,
         LONGEST,
+        NOT_IN_PLAN,
+        NOT_STORED,
         OUTLIER,
         UNDONE,
         CampaignStore,
@@ -77,8 +81,9 @@ else:
             "prior": "read_prior",
             "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
             "sources": "Sources SourceSettings read_source read_sources",
-            "store": "ACCEPTED KEPT LONGEST OUTLIER UNDONE CampaignStore Journal Record StoredCampaign "
-            "StoredModel UnavailableStore begin_journal open_journal open_store stored_model",
+            "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
+            "CampaignStore Journal Record StoredCampaign StoredModel UnavailableStore begin_journal "
+            "open_journal open_store stored_model",
             "text": "make_folder read_text user_path write_text",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
             "write_calibrated_urdf",

@@ -43,7 +43,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.acquisition import Reason, Rejection, Standstill
+from calib_planner.acquisition import REJECTIONS, Rejection, RejectionReason, Standstill
 from calib_planner.arrays import FloatArray, frozen, plain
 from calib_planner.campaign import (
     FIT,
@@ -65,7 +65,18 @@ from calib_planner.units import cut
 
 # ── records ──────────────────────────────────────────────────────────────────────────────────────────
 
-ACCEPTED, OUTLIER, UNDONE = "accepted", "outlier", "undone"
+ACCEPTED, OUTLIER, UNDONE, NOT_STORED = "accepted", "outlier", "undone", "not_stored"
+NOT_IN_PLAN, CLOCK_OFFSET = "not_in_plan", "clock_offset"
+DECISIONS = {
+    ACCEPTED: "It is used.",
+    OUTLIER: "It disagrees with the other measurements. Check the reflector's seat, measure again.",
+    UNDONE: "It was withdrawn on request. Measure again if it is still needed.",
+    NOT_STORED: "It could not be written to disk. Make space or repair the folder, measure again.",
+    NOT_IN_PLAN: "No planned configuration is near. Check the pose, or allow unplanned measurements.",
+    CLOCK_OFFSET: "The clocks of joints and tracker differ. Synchronise them, measure again.",
+    **REJECTIONS,
+}
+"""Everything that can be decided about a standstill, with what to do."""
 KEPT = (ACCEPTED, OUTLIER)
 """Decisions about standstills that the identification is given; it rejects outliers itself, every time anew."""
 WIRE = ("configurations", "test_poses")
@@ -80,7 +91,7 @@ class Record:
 
     Attributes:
         acquired: The standstill, or why it was none.
-        status: ``accepted``, ``outlier``, ``undone``, ``not_in_plan``, … or the value of a ``Reason``.
+        status: A key of ``DECISIONS``.
         reason: In words; empty when accepted in full.
         index: Row of the plan, or ``None``.
         repetition: Number of this measurement at its configuration, from 0.
@@ -137,7 +148,7 @@ def record_of(path: str | Path, row: Mapping[str, Any], joints: int, targets: in
             raise FileFormatError(path, f"{where}, samples", f"{samples.size} targets", f"{targets} targets")
         if row["rejected"] is not None:
             acquired: Standstill | Rejection
-            acquired = Rejection(start, end, Reason(row["rejected"]), row["message"], q, samples)
+            acquired = Rejection(start, end, RejectionReason(row["rejected"]), row["message"], q, samples)
         else:
             acquired = Standstill(start, end, q, array("points", targets, 3), array("std", targets), samples)
         decided = (row["status"], row["reason"], row["configuration"], row["repetition"])

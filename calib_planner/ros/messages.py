@@ -19,9 +19,11 @@ from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from calib_planner.acquisition import NANO, Reason, Rejection, Standstill, pick_joints
+from calib_planner.acquisition import NANO, Rejection, Standstill, pick_joints
 from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
+from calib_planner.io import ACCEPTED, DECISIONS
+from calib_planner.planning import STATUS as PLAN_WORDS
 from calib_planner.planning import Pace, Plan, PlanQuality, timetable
 from calib_planner.robot import Robot
 from calib_planner.units import brief
@@ -30,13 +32,7 @@ MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""
 MOST_REPETITIONS = 100_000
 
-PLAN_STATUS = {
-    "ok": PlanMessage.STATUS_OK,
-    "time_limit": PlanMessage.STATUS_TIME_LIMIT,
-    "cancelled": PlanMessage.STATUS_CANCELLED,
-    "singular": PlanMessage.STATUS_SINGULAR,
-    "empty": PlanMessage.STATUS_EMPTY,
-}
+PLAN_STATUS = {word: getattr(PlanMessage, f"STATUS_{word.upper()}") for word in (*PLAN_WORDS, "empty")}
 ESTIMATE_STATUS = {
     "ok": CalibrationEstimate.STATUS_OK,
     "too_few": CalibrationEstimate.STATUS_TOO_FEW_MEASUREMENTS,
@@ -45,17 +41,8 @@ ESTIMATE_STATUS = {
     "error": CalibrationEstimate.STATUS_ERROR,
 }
 MEASUREMENT_STATUS = {
-    "accepted": Measurement.ACCEPTED,
-    Reason.MOVED.value: Measurement.REJECTED_MOVED,
-    Reason.TOO_FEW_SAMPLES.value: Measurement.REJECTED_TOO_FEW_SAMPLES,
-    Reason.TIME_SKEW.value: Measurement.REJECTED_TIME_SKEW,
-    Reason.OTHER_FRAME.value: Measurement.REJECTED_OTHER_FRAME,
-    Reason.NOT_FINITE.value: Measurement.REJECTED_NOT_FINITE,
-    "not_in_plan": Measurement.REJECTED_NOT_IN_PLAN,
-    "outlier": Measurement.REJECTED_OUTLIER,
-    "undone": Measurement.REJECTED_UNDONE,
-    "not_stored": Measurement.REJECTED_NOT_STORED,
-    "clock_offset": Measurement.REJECTED_CLOCK_OFFSET,
+    word: getattr(Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}")
+    for word in DECISIONS
 }
 
 
@@ -216,7 +203,7 @@ def measurement_message(
     joint_names: Sequence[str],
     frame_id: str,
     *,
-    status: str = "accepted",
+    status: str = ACCEPTED,
     reason: str = "",
     plan_id: str = "",
     index: int | None = None,
@@ -297,7 +284,7 @@ def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
         "sigma_estimate": float(estimate.residuals.sigma),
         "residual_rms_before": float(estimate.residuals.before.rms),
         "residual_rms_after": float(estimate.residuals.after.rms),
-        "status": ESTIMATE_STATUS.get(estimate.fit.status, CalibrationEstimate.STATUS_ERROR),
+        "status": ESTIMATE_STATUS[estimate.fit.status],
         "message": estimate.fit.message,
         "condition": float("nan"),
         "outliers": len(estimate.points.rejected),

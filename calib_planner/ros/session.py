@@ -28,6 +28,8 @@ from calib_planner.identification import UPDATE, Estimate, IdentificationProblem
 from calib_planner.io import (
     ACCEPTED,
     KEPT,
+    NOT_IN_PLAN,
+    NOT_STORED,
     OUTLIER,
     UNDONE,
     CampaignStore,
@@ -46,7 +48,6 @@ from calib_planner.units import brief, cut, listed
 
 MOST_REJECTIONS = 10_000
 """Rejected standstills of a campaign that are written; more are only counted: nobody shall fill the disk."""
-NOT_STORED = "not_stored"
 
 
 @dataclass(frozen=True)
@@ -170,10 +171,10 @@ class Campaign:
         if objection is not None:
             return self._reject(Record(found, *objection, index, 0, frame=frame))
         if reason and not how.accept_unplanned:
-            return self._reject(Record(found, "not_in_plan", reason, None, 0, frame=frame))
+            return self._reject(Record(found, NOT_IN_PLAN, reason, None, 0, frame=frame))
         if len(self.kept) >= how.most:
             reason = f"{how.most} measurements are kept at most: raise most_measurements or call ~/reset"
-            return self._reject(Record(found, "not_in_plan", reason, index, 0, frame=frame))
+            return self._reject(Record(found, NOT_IN_PLAN, reason, index, 0, frame=frame))
         decision = Record(found, ACCEPTED, "", index, self.done()[index], frame=frame)
         try:
             decision = replace(decision, number=self.store.record(self._ensure_begun(), decision))

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_planner.acquisition import NANO, Reason, Rejection, Standstill, StandstillDetector, StandstillSettings
+from calib_planner.acquisition import (
+    NANO,
+    Rejection,
+    RejectionReason,
+    Standstill,
+    StandstillDetector,
+    StandstillSettings,
+)
 from calib_planner.errors import InputError
 
 SIGMA = 3e-5
@@ -138,7 +145,7 @@ def test_short_pauses_are_no_standstill() -> None:
     assert feed(StandstillDetector(2), messages) == []
 
 
-def one_rejection(results: list[Standstill | Rejection], reason: Reason) -> Rejection:
+def one_rejection(results: list[Standstill | Rejection], reason: RejectionReason) -> Rejection:
     assert len(results) == 1 and isinstance(results[0], Rejection), results
     assert results[0].reason is reason and results[0].message
     return results[0]
@@ -146,7 +153,7 @@ def one_rejection(results: list[Standstill | Rejection], reason: Reason) -> Reje
 
 def test_moving_target_while_joints_rest() -> None:
     shaken = [(t, k, v + np.array([1e-3 * np.sin(20e-9 * t), 0, 0]) if k else v) for t, k, v in stream([0.0])]
-    found = one_rejection(feed(StandstillDetector(2), shaken), Reason.MOVED)
+    found = one_rejection(feed(StandstillDetector(2), shaken), RejectionReason.MOVED)
     assert "target 1 moved" in found.message
 
 
@@ -161,14 +168,14 @@ def test_vibration_that_dies_out_is_waited_for() -> None:
 def test_no_tracker() -> None:
     joints = [m for m in stream([0.0, 0.5]) if m[1] == 0]
     results = feed(StandstillDetector(2), joints)
-    assert [r.reason for r in results if isinstance(r, Rejection)] == [Reason.TOO_FEW_SAMPLES] * 2
+    assert [r.reason for r in results if isinstance(r, Rejection)] == [RejectionReason.TOO_FEW_SAMPLES] * 2
 
 
 def test_robot_moves_on_too_soon() -> None:
     settings = StandstillSettings(samples=40, minimum_samples=30, duration=0.8)
     results = feed(StandstillDetector(2, 1, settings), stream([0.0, 0.5, 0.0], dwell=0.6))
     assert len(results) == 3
-    one_rejection(results[:1], Reason.MOVED)
+    one_rejection(results[:1], RejectionReason.MOVED)
 
 
 def test_patience_takes_the_targets_that_are_seen() -> None:
@@ -189,7 +196,7 @@ def test_clock_skew_is_reported(offset: float) -> None:
     live = sorted(messages, key=lambda m: m[0] - (offset * NANO if m[1] else 0))
     results = feed(StandstillDetector(2), live)
     assert not any(isinstance(r, Standstill) for r in results)
-    assert results[0].reason is Reason.TIME_SKEW  # type: ignore[union-attr]
+    assert results[0].reason is RejectionReason.TIME_SKEW  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("offset", [2.0, -2.0])
@@ -197,24 +204,24 @@ def test_clock_skew_is_said_again_and_again_but_not_each_time(offset: float) -> 
     messages = stream([*STOPS, *STOPS], offset=offset)
     live = sorted(messages, key=lambda m: m[0] - (offset * NANO if m[1] else 0))
     results = [r for r in feed(StandstillDetector(2), live, flush=False) if isinstance(r, Rejection)]
-    skew = [r for r in results if r.reason is Reason.TIME_SKEW and r.start == r.end]
+    skew = [r for r in results if r.reason is RejectionReason.TIME_SKEW and r.start == r.end]
     assert 4 <= len(skew) <= 6  # 12 s, and every 2 s after half a second or a whole one
     assert all("behind the others" in r.message for r in skew)
     # A standstill without points does not send anybody to look for the tracker.
-    assert all(r.reason is Reason.TIME_SKEW for r in results[1:])
+    assert all(r.reason is RejectionReason.TIME_SKEW for r in results[1:])
 
 
 def test_nan_points_are_reported_and_do_no_harm() -> None:
     blind = [(t, k, np.full(3, np.nan) if k else v) for t, k, v in stream([0.0])]
     results = feed(StandstillDetector(2), blind)
-    assert {r.reason for r in results if isinstance(r, Rejection)} == {Reason.NOT_FINITE}
+    assert {r.reason for r in results if isinstance(r, Rejection)} == {RejectionReason.NOT_FINITE}
     some = [(t, k, v * np.nan if k and i % 7 == 0 else v) for i, (t, k, v) in enumerate(stream(STOPS))]
     check_stops(feed(StandstillDetector(2), some), STOPS)
 
 
 def test_nan_joints_are_reported() -> None:
     blind = [(t, k, v if k else np.full(2, np.inf)) for t, k, v in stream([0.0])]
-    one_rejection(feed(StandstillDetector(2), blind), Reason.NOT_FINITE)
+    one_rejection(feed(StandstillDetector(2), blind), RejectionReason.NOT_FINITE)
 
 
 def test_clock_set_back_recovers() -> None:

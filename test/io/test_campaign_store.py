@@ -13,13 +13,13 @@ from robots import changed
 from stores import MODEL, assert_same, begun, decision, opened, standstill
 
 from calib_planner import Plan
-from calib_planner.acquisition import Reason, Rejection, Standstill
+from calib_planner.acquisition import Rejection, RejectionReason, Standstill
 from calib_planner.errors import FileFormatError, InputError, StoreError
 from calib_planner.io import LONGEST, CampaignStore, StoredModel, UnavailableStore, stored_model
 from calib_planner.io import store as store_file
 from calib_planner.io.store import FILE, MIGRATIONS
 
-MOVED = Rejection(3, 4, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0]))
+MOVED = Rejection(3, 4, RejectionReason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0]))
 
 
 # ── exact ────────────────────────────────────────────────────────────────────────────────────────────
@@ -30,7 +30,9 @@ def test_what_was_written_comes_back_to_the_bit(tmp_path: Path, planned: Plan) -
         decision(standstill(1)),
         decision(standstill(2, seen=(False, True)), unused=(1,), reason="target 2 …"),
         decision(
-            Rejection(3, 4, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0])), "moved", index=None
+            Rejection(3, 4, RejectionReason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0])),
+            "moved",
+            index=None,
         ),
         decision(standstill(4), "not_in_plan", index=None),
     ]

@@ -20,10 +20,10 @@ import pytest
 from robots import plan_of, random_configurations
 
 from calib_planner import Estimate, Plan, Robot
-from calib_planner.acquisition import NANO, Reason, Rejection, Standstill
+from calib_planner.acquisition import NANO, Rejection, RejectionReason, Standstill
 from calib_planner.errors import InputError, StoreError
-from calib_planner.io import CampaignStore, StoredModel, UnavailableStore, open_store
-from calib_planner.ros.session import MOST_REJECTIONS, NOT_STORED, Campaign, Matching, condition_of
+from calib_planner.io import NOT_STORED, CampaignStore, StoredModel, UnavailableStore, open_store
+from calib_planner.ros.session import MOST_REJECTIONS, Campaign, Matching, condition_of
 from calib_planner.simulation import random_deviations
 
 HOW = Matching(sigma=3e-5)
@@ -136,7 +136,7 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path) -> None:
     withdrawn = campaign.undo(campaign.kept[2].number)
     assert withdrawn is not None and withdrawn.index == 2
     campaign.take(replace(seen(0), joints=PLAN.configurations[0] + 0.5), HOW)
-    campaign.refuse(Rejection(1, 2, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3])))
+    campaign.refuse(Rejection(1, 2, RejectionReason.MOVED, "moved", np.full(2, np.nan), np.array([3])))
     before = campaign.estimate(HOW)
     campaign.judge()
     store.close()
@@ -198,7 +198,7 @@ def test_rejections_cannot_fill_the_disk(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("calib_planner.ros.session.MOST_REJECTIONS", 20)
     assert MOST_REJECTIONS > 20
     campaign = begun(opened(""))
-    wrong = Rejection(1, 2, Reason.MOVED, "moved", np.zeros(2), np.array([3]))
+    wrong = Rejection(1, 2, RejectionReason.MOVED, "moved", np.zeros(2), np.array([3]))
     numbers = [campaign.refuse(wrong).number for _ in range(50)]
     assert sum(n > 0 for n in numbers) == 20 and campaign.rejections == {"moved": 50}
     assert measure(campaign, seen(0)) == ["accepted"]

@@ -13,7 +13,7 @@ from geometry_msgs.msg import Point, PointStamped
 from sensor_msgs.msg import JointState
 
 from calib_planner import IdentificationProblem, Plan, PlanProblem, Robot, identify, plan
-from calib_planner.acquisition import Reason, Rejection, Standstill
+from calib_planner.acquisition import Rejection, RejectionReason, Standstill
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import STATUS as LIBRARY_ESTIMATE_STATUS
 from calib_planner.planning import Search
@@ -40,7 +40,7 @@ def message(planned: Plan) -> PlanMessage:
 def test_every_status_has_a_constant() -> None:
     assert set(LIBRARY_PLAN_STATUS) <= set(c.PLAN_STATUS)
     assert set(LIBRARY_ESTIMATE_STATUS) <= set(c.ESTIMATE_STATUS)
-    assert {r.value for r in Reason} <= set(c.MEASUREMENT_STATUS)
+    assert {r.value for r in RejectionReason} <= set(c.MEASUREMENT_STATUS)
     for message, table, prefix in (
         (PlanMessage, c.PLAN_STATUS, "STATUS_"),
         (CalibrationEstimate, c.ESTIMATE_STATUS, "STATUS_"),
@@ -153,7 +153,7 @@ def test_standstill_to_measurement() -> None:
 
 
 def test_rejection_to_measurement() -> None:
-    found = Rejection(0, 10**9, Reason.MOVED, "moved", np.array([0.1]), np.array([3]))
+    found = Rejection(0, 10**9, RejectionReason.MOVED, "moved", np.array([0.1]), np.array([3]))
     message = c.measurement_message(found, ["a"], "tracker", status="moved", reason="moved")
     assert message.status == Measurement.REJECTED_MOVED and message.reason == "moved"
     assert message.configuration_index == Measurement.UNPLANNED and not message.points

@@ -19,6 +19,7 @@ from calib_planner.cli import CLOSED_PIPE, DONE, FAILED, INTERRUPTED, WRONG_USAG
 from calib_planner.compensation import STATUS as COMPENSATION
 from calib_planner.identification import RULES, Rule
 from calib_planner.identification import STATUS as ESTIMATE
+from calib_planner.io import DECISIONS
 from calib_planner.planning import PROOF_STATUS
 from calib_planner.planning import STATUS as PLAN
 
@@ -47,6 +48,7 @@ def page() -> str:
     for title, status in (
         ("Plan", PLAN),
         ("Bound of a plan, with `--prove`", PROOF_STATUS),
+        ("Standstill of the identifier node", DECISIONS),
         ("Estimate", ESTIMATE),
         ("Corrected targets (`compensate`), row by row", COMPENSATION),
     ):

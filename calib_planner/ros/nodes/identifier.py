@@ -23,7 +23,7 @@ from calib_planner import __version__
 from calib_planner.acquisition import Intake, Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.identification import Estimate
-from calib_planner.io import ACCEPTED, Record, UnavailableStore, calibrated_urdf, open_store
+from calib_planner.io import ACCEPTED, CLOCK_OFFSET, Record, UnavailableStore, calibrated_urdf, open_store
 from calib_planner.ros import session
 from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
@@ -305,7 +305,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
                 self._output.decision(campaign, campaign.refuse(found, intake.frame))
                 continue
             text = intake.offset_text(self.settings.value.clock_offset)
-            decision = campaign.take(found, self._how, intake.frame, ("clock_offset", text) if text else None)
+            decision = campaign.take(found, self._how, intake.frame, (CLOCK_OFFSET, text) if text else None)
             self._output.decision(campaign, decision)
             if decision.status == ACCEPTED:
                 intake.bound = bool(intake.frame)
@@ -323,7 +323,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         try:
             for decision in gone:
                 text = f"taken before it was seen: {intake.offset_text(bound)}"
-                self._output.decision(campaign, campaign.withdraw(decision, "clock_offset", text))
+                self._output.decision(campaign, campaign.withdraw(decision, CLOCK_OFFSET, text))
         except StoreError as error:
             self.get_logger().error(f"not withdrawn, tried again: {error}", throttle_duration_sec=5.0)
         if gone:
