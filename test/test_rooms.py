@@ -198,6 +198,13 @@ def test_users_import_from_doors_only(where: str, text: str) -> None:
     assert len(left) <= LEFT_DEEP.get(where, 0), left
 
 
+def test_the_python_page_shows_what_doors_offer() -> None:
+    page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\.\. auto\w+:: (calib_planner\.\S+)$", page, re.MULTILINE)
+    assert len(shown) > 10
+    assert not [name for name in shown if name.count(".") > 2]
+
+
 def test_no_cycle_of_files() -> None:
     doors = {m for m, p in EVERY.items() if p.name == "__init__.py"}
     graph = {m: {t for t, _ in ours(tree_of(p)) if t in EVERY and t != m} for m, p in EVERY.items()}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         write_measurements,
     )
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
-    from calib_planner.io.kinematics import write_kinematics
+    from calib_planner.io.kinematics import read_kinematics, write_kinematics
     from calib_planner.io.plan import read_plan, write_plan
     from calib_planner.io.prior import read_prior
     from calib_planner.io.sheet import (
@@ -76,7 +76,7 @@ else:
             "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
             "read_plan_csv write_configurations write_measurements",
             "estimate": "calibrated_robot placement read_estimate write_estimate",
-            "kinematics": "write_kinematics",
+            "kinematics": "read_kinematics write_kinematics",
             "plan": "read_plan write_plan",
             "prior": "read_prior",
             "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
