@@ -12,10 +12,10 @@ import pytest
 from robots import changed
 from stores import MODEL, assert_same, begun, decision, opened, standstill
 
-from calib_planner import Plan
+from calib_planner import Plan, Robot
 from calib_planner.acquisition import Rejection, RejectionReason, Standstill
 from calib_planner.errors import FileFormatError, InputError, StoreError
-from calib_planner.io import LONGEST, CampaignStore, StoredModel, UnavailableStore, stored_model
+from calib_planner.io import LONGEST, CampaignStore, StoredModel, UnavailableStore, open_journal, stored_model
 from calib_planner.io import store as store_file
 from calib_planner.io.store import FILE, MIGRATIONS
 
@@ -307,3 +307,34 @@ def test_without_a_folder_it_is_in_memory(tmp_path: Path, monkeypatch: pytest.Mo
     store.record(begun(store), decision(standstill(1)))
     found = store.current()
     assert found is not None and len(found.records) == 1 and not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_the_version_before_is_read_whole(tmp_path: Path) -> None:
+    """``written_before`` is what the store and the journal wrote when they were two modules; nothing is lost."""
+    for file in (Path(__file__).parent / "written_before").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    store = opened(tmp_path)
+    found = store.current()
+    assert (
+        found is not None and found.plan_id == "p" and found.plan is not None and found.plan.robot == "planar_2r"
+    )
+    assert [r.status for r in found.records] == ["undone", "accepted", "accepted"]
+    assert [row["status"] for row in store.history(1)] == ["accepted", "undone"]
+    for k, record in enumerate(found.records, 1):
+        written = decision(standstill(k, seen=(True, k != 2)), number=k)
+        assert_same(written if k > 1 else written.now("undone", "by hand"), record)
+    assert store.record(found.number, decision(standstill(4))) == 4
+    store.close()
+
+    stored = open_journal(tmp_path, Robot.load("planar_2r"))
+    assert stored is not None and stored.campaign_id == "abc" and not stored.finished
+    assert [(number, role) for number, role, *_ in stored.rows] == [(11, "fit"), (14, "fit"), (15, "validation")]
+    q, points = (
+        np.random.default_rng(0).uniform(-1.5, 1.5, (6, 2)),
+        np.random.default_rng(1).normal(size=(6, 1, 3)),
+    )
+    for (_, _, configuration, measured), k in zip(stored.rows, (0, 3, 4), strict=True):
+        assert configuration == q[k].tolist() and measured == (points[k] / 3.0).tolist()
+    assert [(e.q.tolist(), e.reason, e.requested) for e in stored.exclusions] == [
+        (q[2].tolist(), "a wall", False)
+    ]
