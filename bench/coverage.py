@@ -120,8 +120,8 @@ def problem_of(cell: Cell, data: Measurements, **changes: Any) -> Identification
 def mistakes(found: Estimate, bad: NDArray[np.bool_]) -> dict[str, int]:
     """Bad points that were used and good ones that were not."""
     out = np.zeros_like(bad)
-    for point in found.rejected:
-        out[point["row"], point["target"] - 1] = True
+    for point in found.points.rejected:
+        out[point.row, point.target - 1] = True
     return {"bad": int(bad.sum()), "missed": int((bad & ~out).sum()), "false_alarms": int((out & ~bad).sum())}
 
 
@@ -132,18 +132,18 @@ def one_interval(case: Case, seed: int) -> dict[str, Any]:
     poses = cell.configurations(20)
     problem = problem_of(cell, data, test_poses=poses)
     found = identify(problem)
-    freedom = {"residuals": found.chi_square.freedom, "repetitions": found.noise.repeat_freedom}
+    freedom = {"residuals": found.residuals.chi_square.freedom, "repetitions": found.noise.repeat_freedom}
     factor = student.ppf(0.975, freedom.get(found.noise.source, np.inf))
-    error = (found.deviations - true_deviations(problem, found, cell)) / found.std
+    error = (found.fit.deviations - true_deviations(problem, found, cell)) / found.fit.std
     left = found.positions(poses) - cell.points(poses)
     checked = validate(problem, found, [cell.measure(poses, 1)]).validation
     assert checked is not None
     return {
-        "names": found.parameters,
+        "names": found.fit.parameters,
         "error": error,
         "factor": float(factor),
         "achieved": float(np.mean(np.sum(left**2, axis=2))),
-        "predicted": found.predicted_accuracy**2,
+        "predicted": found.accuracy.overall**2,
         "within_95": checked.within_95,
         "corrections": found.transmission is not None,
         **mistakes(found, bad),
@@ -182,7 +182,11 @@ def one_noise(case: Case, seed: int) -> dict[str, Any]:
     found = identify(problem_of(cell, cell.measure(cell.configurations(case.count), case.repetitions)))
     noise = found.noise
     parts = {name: getattr(noise, name) for name in ("measurement", "repeatability", "point", "turning")}
-    return parts | {"found": noise.discrepancy > 0, "scaled": noise.scaled > 1, "seconds": found.seconds}
+    return parts | {
+        "found": noise.discrepancy > 0,
+        "scaled": noise.scaled > 1,
+        "seconds": found.diagnostics.seconds,
+    }
 
 
 # ── all seeds ────────────────────────────────────────────────────────────────────────────────────────

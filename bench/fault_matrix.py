@@ -36,7 +36,7 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import CalibPlannerError
 from calib_planner.identification import Estimate
 from calib_planner.planning import Search
-from calib_planner.robot import analyse
+from calib_planner.robot import analyse, is_nuisance
 from calib_planner.simulation import Faults, SimulatedCell, World, make_tour, play, random_deviations
 
 SIGMA = 3e-5
@@ -152,7 +152,7 @@ def true_deviations(robot: Robot, q: FloatArray, seed: int) -> dict[str, float]:
     found = analyse(robot.jacobian(q).reshape(-1, len(robot.parameter_names)), robot.parameter_names)
     kept = {robot.parameter_names[i] for i in found.kept}
     drawn = random_deviations(robot, seed)
-    return {n: v for n, v in drawn.items() if n in kept and not n.startswith(("base.", "target_"))}
+    return {n: v for n, v in drawn.items() if n in kept and not is_nuisance(n)}
 
 
 def measure(world: World, q: FloatArray, visits: IntArray) -> tuple[list[Standstill], Counter[str]]:
@@ -203,8 +203,8 @@ def run(setup: str, fault: str, seed: int) -> Run:
 def worst_error(found: Estimate, truth: dict[str, float]) -> tuple[float, str]:
     """Largest |error|/std of the robot's own parameters that were identified, and whose."""
     worst, where = 0.0, ""
-    for name, value, std in zip(found.parameters, found.deviations, found.std, strict=True):
-        if name.startswith(("base.", "target_")) or not np.isfinite(std) or name in found.held:
+    for name, value, std in zip(found.fit.parameters, found.fit.deviations, found.fit.std, strict=True):
+        if is_nuisance(name) or not np.isfinite(std) or name in found.observability.fixed:
             continue
         ratio = abs(value - truth.get(name, 0.0)) / std
         if ratio > worst:
@@ -215,11 +215,11 @@ def worst_error(found: Estimate, truth: dict[str, float]) -> tuple[float, str]:
 def limited(found: Estimate, truth: dict[str, float], world: World) -> bool:
     """Whether the verdict names errors of the joints that account for those of the parameters and at the pose."""
     named = any(r.code == "local" for r in found.verdict.reasons)
-    if not world.faults.transmission_error or found.hidden is None or not named:
+    if not world.faults.transmission_error or found.diagnostics.hidden is None or not named:
         return False
-    wider = replace(found, std=np.hypot(found.std, found.hidden.shifts))
-    there = np.hypot(found.predicted_accuracy, found.hidden.at_test_poses[0])
-    off = error_at_pose(found, world) * found.predicted_accuracy
+    wider = replace(found, fit=replace(found.fit, std=np.hypot(found.fit.std, found.diagnostics.hidden.shifts)))
+    there = np.hypot(found.accuracy.overall, found.diagnostics.hidden.at_test_poses[0])
+    off = error_at_pose(found, world) * found.accuracy.overall
     return bool(worst_error(wider, truth)[0] <= WITHIN and off <= WITHIN * there)
 
 
@@ -227,7 +227,7 @@ def error_at_pose(found: Estimate, world: World) -> float:
     """Distance between the true target and the prediction at ``POSE``, over the predicted accuracy there."""
     actual = world.transmission.actual(POSE) if world.faults.transmission_error else POSE
     error = world.cell.truth.positions(actual) - found.positions(POSE)
-    return float(np.linalg.norm(error) / found.predicted_accuracy)
+    return float(np.linalg.norm(error) / found.accuracy.overall)
 
 
 # ── the matrix ───────────────────────────────────────────────────────────────────────────────────────

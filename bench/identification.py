@@ -149,8 +149,11 @@ def one_cell(robot: Robot, seed: int, urdf: Path | None, python: str | None, rep
         times = np.median(np.vstack([before[name], after[name]]), axis=0)
         found = found_by(question, data, options)
         run[name] = dict(zip(keys, times, strict=True)) | {"first_seconds": before[name][0, 0]}
-        run[name] |= {"error_m": mean_error(found.calibrated.positions(truth.q), truth), "parameters": found.rank}
-        run[name] |= {"used": found.used, "iterations": found.iterations, "status": found.status}
+        run[name] |= {
+            "error_m": mean_error(found.calibrated.positions(truth.q), truth),
+            "parameters": found.observability.rank,
+        }
+        run[name] |= {"used": found.points.used, "iterations": found.fit.iterations, "status": found.fit.status}
     return run | theirs
 
 
@@ -233,7 +236,14 @@ def _one(
     test = other.select(np.setdiff1d(np.arange(len(other)), chosen)) if other is source else other
     errors = predicted(found, test)
     rms = float(np.sqrt(np.mean(errors**2)))
-    figures = (float(errors.mean()), rms, found.rank, found.used, int(found.status != "not_converged"), seconds)
+    figures = (
+        float(errors.mean()),
+        rms,
+        found.observability.rank,
+        found.points.used,
+        int(found.fit.status != "not_converged"),
+        seconds,
+    )
     return dict(zip(FIGURES, figures, strict=True))
 
 

@@ -130,12 +130,12 @@ def spoil(data: Measurements, case: Case, rng: np.random.Generator) -> tuple[Mea
 def true_deviations(problem: IdentificationProblem, found: Estimate, cell: Cell) -> FloatArray:
     """(P,) deviations that reproduce the true robot, those held as they are."""
     if not cell.case.placed:
-        return np.array([cell.truth.deviations[name] for name in found.parameters])
+        return np.array([cell.truth.deviations[name] for name in found.fit.parameters])
     robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
-    kept = np.flatnonzero(np.isfinite(found.std))
+    kept = np.flatnonzero(np.isfinite(found.fit.std))
     low, high = robot.joint_limits.T
     q = np.random.default_rng(1).uniform(low, high, (100, len(low)))
-    truth, deviations = cell.truth.truth.positions(q).ravel(), found.deviations.copy()
+    truth, deviations = cell.truth.truth.positions(q).ravel(), found.fit.deviations.copy()
     for _ in range(6):
         jacobian = np.ascontiguousarray(robot.jacobian(q, deviations)).reshape(len(truth), -1)[:, kept]
         scale = np.linalg.norm(jacobian, axis=0)

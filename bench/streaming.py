@@ -74,10 +74,14 @@ def processor(job: Callable[[], object]) -> float:
 
 def deviation(one: Estimate, other: Estimate) -> float:
     """Largest difference; infinite where other parameters are held or other points rejected."""
-    same = [[(r["row"], r["target"]) for r in e.rejected] for e in (one, other)]
-    if same[0] != same[1] or one.held != other.held:
+    same = [[(r.row, r.target) for r in e.points.rejected] for e in (one, other)]
+    if same[0] != same[1] or one.observability.fixed != other.observability.fixed:
         return float("inf")
-    pairs = [(one.values, other.values), (one.std, other.std), (one.residuals, other.residuals)]
+    pairs = [
+        (one.fit.values, other.fit.values),
+        (one.fit.std, other.fit.std),
+        (one.residuals.vectors, other.residuals.vectors),
+    ]
     return max(float(np.nanmax(np.abs(a - b))) for a, b in pairs)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import field, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -126,6 +127,30 @@ def check_count(field: str, value: object, *, low: int = 1, high: int = 10_000_0
     if not low <= int(value) <= high:
         raise InputError(field, repr(value), expected)
     return int(value)
+
+
+def ranged(default: float, description: str, unit: str, low: float, high: float) -> Any:
+    """A dataclass field with a default (an int makes it a whole number), description, unit and range.
+
+    ``check_ranges`` and the parameters of the nodes read them, so that they stand here only.
+    """
+    return field(default=default, metadata={"description": description, "unit": unit, "low": low, "high": high})
+
+
+def check_ranges(settings: Any, kind: type) -> None:
+    """Check the fields of ``settings`` that ``kind`` declares with ``ranged``, and store them as int or float.
+
+    Raises:
+        InputError: A value is of another type, not finite or out of its range.
+    """
+    for item in fields(kind):
+        low, high, unit = (item.metadata[k] for k in ("low", "high", "unit"))
+        given = getattr(settings, item.name)
+        if isinstance(item.default, int):
+            value: float = check_count(item.name, given, low=low, high=high)
+        else:
+            value = check_number(item.name, given, low=low, high=high, unit=unit)
+        object.__setattr__(settings, item.name, value)
 
 
 # ── One thread of linear algebra while we compute: our matrices are small ───────────────────────────────────

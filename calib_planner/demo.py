@@ -1,4 +1,9 @@
-"""The demonstration without ROS: plan, measure in simulation, identify, compare with truth and chance."""
+"""The demonstration without ROS: plan, measure in simulation, identify, compare with the truth and with chance.
+
+``demo_report`` needs the hidden truth, so it works in simulation only; the demonstration over ROS uses it, too.
+The library itself makes the comparison with chance: random plans of the same size, the same true robot, the same
+noise, fresh draws.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +20,12 @@ from rich.table import Table
 from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
-from calib_planner.io import write_estimate, write_measurements, write_plan, write_text
+from calib_planner.io import make_folder, write_estimate, write_measurements, write_plan, write_text
 from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, Search, error_variance, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
-from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.simulation import SimulatedCell, independent_seeds, random_deviations
+from calib_planner.units import MILLI_UNIT
 
 RANDOM_PLANS = 100
 """Random plans that stand for chance: one alone may be lucky."""
@@ -49,82 +55,8 @@ class DemoSettings:
     seed: int = 0
 
 
-def run_demo(
-    settings: DemoSettings,
-    folder: str | Path,
-    callback: Callable[[Progress], bool | None] | None = None,
-) -> DemoResult:
-    """Run the demonstration and leave its files in ``folder``, which is made if need be.
-
-    Raises:
-        InputError: The folder cannot be made or written.
-    """
-    folder = _make(folder)
-    robot = Robot.load(ROBOT)
-    problem = PlanProblem(
-        robot,
-        [TEST_POSE],
-        settings.configurations,
-        settings.repetitions,
-        noise=settings.sigma,
-        search=Search(starts=settings.starts, seed=settings.seed),
-    )
-    found = plan(problem, callback)
-    truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)
-    truth = random_deviations(robot, truth_seed)
-    cell = SimulatedCell(robot, truth, settings.sigma)
-    data = cell.measure(found.configurations, found.repetitions, noise_seed)
-    asked = IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE])
-    estimate = identify(asked)
-    result = demo_report(
-        problem,
-        found,
-        estimate,
-        truth,
-        seed=chance_seed,
-        random_plans=settings.random_plans,
-        report=folder,
-    )
-    write_plan(folder / "plan.yaml", found)
-    write_measurements(folder / "measurements.csv", data)
-    write_estimate(folder / "estimate.yaml", estimate)
-    made = provenance(
-        [("robot", ROBOT), ("data", folder / "measurements.csv")],
-        seed=settings.seed,
-        estimate=str(folder / "estimate.yaml"),
-    )
-    write_report(folder / "calibration.html", asked, estimate, made)
-    write_text(folder / "demo.json", json.dumps(result.to_dict(), indent=2, ensure_ascii=False) + "\n")
-    draw(result, folder / "demo.png")
-    return result
-
-
-def independent_seeds(seed: int, count: int) -> list[int]:
-    """Seeds whose random numbers have nothing to do with each other, all from one."""
-    return [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
-
-
-def _make(folder: str | Path) -> Path:
-    path = Path(folder).expanduser()
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = f"{folder} ({error.strerror})"
-        raise InputError("output", reason, "a folder that can be made", "choose another") from None
-    return path
-
-
-# ── What a demonstration ends with: truth beside estimate, before beside after, planned beside random ───────
-# ``demo_report`` needs the hidden truth, so it works in simulation only. The comparison with chance is made by
-# the library, not over ROS: random plans of the same size, the same true robot, the same noise, fresh draws.
-
-
-SHOWN_UNIT = {"m": "mm", "rad": "mrad"}
-"""Units of tables and pictures; both are 1000 times the SI value."""
-
-
 class IdentifiedParameters(Protocol):
-    """What is needed of an estimate; ``Estimate`` has it.
+    """What ``demo_report`` needs of an estimate; ``Estimate.fit`` has it.
 
     Attributes:
         parameters: P names.
@@ -142,15 +74,7 @@ class IdentifiedParameters(Protocol):
 
 @dataclass(frozen=True)
 class DemoParameter:
-    """One parameter, all numbers in its unit.
-
-    Attributes:
-        name, unit: Name; ``m`` or ``rad``.
-        nominal: What the controller believes.
-        true: What the simulated robot has.
-        value: What was identified.
-        std: Standard deviation of ``value``.
-    """
+    """One parameter: nominal, true (simulated) and identified value with its std, in ``unit``, m or rad."""
 
     name: str
     unit: str
@@ -196,6 +120,42 @@ class DemoResult:
         return result
 
 
+def run_demo(
+    settings: DemoSettings,
+    folder: str | Path,
+    callback: Callable[[Progress], bool | None] | None = None,
+) -> DemoResult:
+    """Run the demonstration and leave its files in ``folder``, which is made if need be.
+
+    Raises:
+        InputError: The folder cannot be made or written.
+    """
+    folder, robot, size = make_folder(folder), Robot.load(ROBOT), (settings.configurations, settings.repetitions)
+    search = Search(starts=settings.starts, seed=settings.seed)
+    problem = PlanProblem(robot, [TEST_POSE], *size, noise=settings.sigma, search=search)
+    best = plan(problem, callback)
+    truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)
+    truth = random_deviations(robot, truth_seed)
+    data = SimulatedCell(robot, truth, settings.sigma).measure(best.configurations, best.repetitions, noise_seed)
+    measured = IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE])
+    estimate = identify(measured)
+    result = demo_report(
+        problem, best, estimate.fit, truth, seed=chance_seed, random_plans=settings.random_plans, report=folder
+    )
+    write_plan(folder / "plan.yaml", best)
+    write_measurements(folder / "measurements.csv", data)
+    write_estimate(folder / "estimate.yaml", estimate)
+    files: list[tuple[str, str | Path]] = [("robot", ROBOT), ("data", folder / "measurements.csv")]
+    made = provenance(files, seed=settings.seed, estimate=str(folder / "estimate.yaml"))
+    write_report(folder / "calibration.html", measured, estimate, made)
+    write_text(folder / "demo.json", json.dumps(result.to_dict(), indent=2, ensure_ascii=False) + "\n")
+    draw(result, folder / "demo.png")
+    return result
+
+
+# ── truth beside estimate, before beside after, planned beside random ────────────────────────────────
+
+
 def demo_report(
     problem: PlanProblem,
     plan: Plan,
@@ -209,69 +169,62 @@ def demo_report(
     """Compare an estimate with the truth, and the plan with random ones.
 
     Args:
-        problem: What was planned; its ``noise`` is the noise of the random comparison.
+        problem: The problem that ``plan`` solves; the random plans are measured with its noise.
         plan: What was measured.
         estimate: What was identified.
         truth: True deviation of each parameter [m | rad].
         seed: Of the random plans and their noise.
+        random_plans: Their number.
         report: Folder named in the result.
+
+    Raises:
+        InputError: The estimate lacks parameters of the problem.
     """
-    robot, poses = problem.robot, problem.test_pose_array
-    cell = SimulatedCell(robot, truth, problem.instrument.typical)
-    found = dict(zip(estimate.parameters, map(float, estimate.deviations), strict=True))
+    robot, poses, sigma = problem.robot, problem.test_pose_array, problem.instrument.typical
+    cell = SimulatedCell(robot, truth, sigma)
+    deviations = dict(zip(estimate.parameters, map(float, estimate.deviations), strict=True))
     std = dict(zip(estimate.parameters, map(float, estimate.std), strict=True))
-    missing = [p.name for p in robot.parameters if p.name not in found]
+    missing = [p.name for p in robot.parameters if p.name not in deviations]
     if missing:
         raise InputError("estimate", f"no {', '.join(missing)}", "all parameters of the problem")
     random_after, random_accuracy = _random_plans(problem, cell, seed, random_plans)
+    parameters = []
+    for p in robot.parameters:
+        true, value = p.nominal + float(truth.get(p.name, 0.0)), p.nominal + deviations[p.name]
+        parameters.append(DemoParameter(p.name, p.unit, p.nominal, true, value, std[p.name]))
     return DemoResult(
         robot=robot.name,
         configurations=len(plan.configurations),
         measurements=plan.measurements,
-        sigma=problem.instrument.typical,
+        sigma=sigma,
         before=_rms(cell.position_errors(robot, poses)),
-        after=_rms(cell.position_errors(robot.with_deviations(found), poses)),
+        after=_rms(cell.position_errors(robot.with_deviations(deviations), poses)),
         predicted_accuracy=plan.quality.predicted_accuracy,
         random_after=random_after,
         random_predicted_accuracy=random_accuracy,
         random_plans=random_plans,
-        parameters=tuple(
-            DemoParameter(
-                p.name,
-                p.unit,
-                p.nominal,
-                p.nominal + float(truth.get(p.name, 0.0)),
-                p.nominal + found[p.name],
-                std[p.name],
-            )
-            for p in robot.parameters
-        ),
+        parameters=tuple(parameters),
         report=str(report),
     )
 
 
 def _random_plans(problem: PlanProblem, cell: SimulatedCell, seed: int, count: int) -> tuple[float, float]:
-    """Achieved and predicted accuracy [m], root mean square over random plans of the problem's size."""
-    robot, poses = problem.robot, problem.test_pose_array
+    """Achieved and predicted accuracy [m], root mean square over random plans of the problem's size; (14)."""
+    robot, poses, sigma = problem.robot, problem.test_pose_array, problem.instrument.typical
+    model = InformationModel(robot, problem.instrument, repetitions=problem.repetitions)
+    weights = problem.weight_array / problem.weight_array.sum()
     rng = np.random.default_rng([seed, 3])  # a stream of its own: the truth has [seed, 1]
     low, high = robot.joint_limits.T
     after, predicted = [], []
     for _ in range(count):
         q = rng.uniform(low, high, (problem.configurations, len(low)))
-        predicted.append(_accuracy(robot, q, problem))
+        matrix = model.at(q).sum(axis=0)
+        variances = [error_variance(j, matrix) for j in robot.jacobian(poses)]
+        predicted.append(np.sqrt(weights @ np.array(variances)))
         data = cell.measure(q, problem.repetitions, int(rng.integers(2**31)))
-        estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
+        estimate = identify(IdentificationProblem(robot, data, sigma=sigma))
         after.append(_rms(cell.position_errors(estimate.calibrated, poses)))
     return _rms(np.array(after)), _rms(np.array(predicted))
-
-
-def _accuracy(robot: Robot, q: FloatArray, problem: PlanProblem) -> float:
-    """ρ0 of eq. (14) [m] of a plan with configurations ``q`` (m, joints) [rad | m]."""
-    model = InformationModel(robot, problem.instrument, repetitions=problem.repetitions)
-    matrix = model.at(q).sum(axis=0)
-    variances = [error_variance(j, matrix) for j in robot.jacobian(problem.test_pose_array)]
-    weights = problem.weight_array / problem.weight_array.sum()
-    return float(np.sqrt(weights @ np.array(variances)))
 
 
 def _rms(values: FloatArray) -> float:
@@ -279,6 +232,22 @@ def _rms(values: FloatArray) -> float:
 
 
 # ── for people ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def _shown_errors(result: DemoResult) -> list[tuple[str, str, str, float, float | None]]:
+    """Of each comparison: name in the table and in the picture, colour, achieved and predicted error [mm]."""
+    size, chance = f"{result.configurations} configurations", f"(RMS of {result.random_plans}"
+    return [
+        ("before calibration", "before", "0.6", 1e3 * result.before, None),
+        (f"planned, {size}", "planned", "C0", 1e3 * result.after, 1e3 * result.predicted_accuracy),
+        (
+            f"random, {size} {chance} plans)",
+            f"random\n{chance})",
+            "C1",
+            1e3 * result.random_after,
+            1e3 * result.random_predicted_accuracy,
+        ),
+    ]
 
 
 def print_table(result: DemoResult, console: Console) -> None:
@@ -291,20 +260,14 @@ def print_table(result: DemoResult, console: Console) -> None:
     for p in result.parameters:
         off = abs(p.value - p.true) / p.std if p.std > 0 else float("nan")
         numbers = [f"{1e3 * x:+.4f}" for x in (p.true - p.nominal, p.value - p.nominal)]
-        table.add_row(p.name, SHOWN_UNIT[p.unit], *numbers, f"{1e3 * p.std:.4f}", f"{off:.1f} std")
+        table.add_row(p.name, MILLI_UNIT[p.unit], *numbers, f"{1e3 * p.std:.4f}", f"{off:.1f} std")
     console.print(table)
     errors = Table(title="position error at the test pose [mm]")
     errors.add_column("")
     errors.add_column("achieved", justify="right")
     errors.add_column("predicted ρ0", justify="right")
-    size = f"{result.configurations} configurations"
-    errors.add_row("before calibration", f"{1e3 * result.before:.4f}", "")
-    errors.add_row(f"planned, {size}", f"{1e3 * result.after:.4f}", f"{1e3 * result.predicted_accuracy:.4f}")
-    errors.add_row(
-        f"random, {size} (RMS of {result.random_plans} plans)",
-        f"{1e3 * result.random_after:.4f}",
-        f"{1e3 * result.random_predicted_accuracy:.4f}",
-    )
+    for name, _, _, achieved, predicted in _shown_errors(result):
+        errors.add_row(name, f"{achieved:.4f}", "" if predicted is None else f"{predicted:.4f}")
     console.print(errors)
     console.print(
         f"One measured coordinate has a standard deviation of {1e3 * result.sigma:.4f} mm. "
@@ -323,11 +286,9 @@ def draw(result: DemoResult, path: str | Path) -> Path:
         f"{1e3 * result.before:.2f} mm before, {1e3 * result.after:.4f} mm after"
     )
     _draw_accuracy(accuracy, result)
-    names = [p.name for p in result.parameters]
-    x = np.arange(len(names))
-    true = 1e3 * np.array([p.true - p.nominal for p in result.parameters])
-    value = 1e3 * np.array([p.value - p.nominal for p in result.parameters])
-    std = 1e3 * np.array([p.std for p in result.parameters])
+    x, names = np.arange(len(result.parameters)), [p.name for p in result.parameters]
+    rows = [(p.true - p.nominal, p.value - p.nominal, p.std) for p in result.parameters]
+    true, value, std = 1e3 * np.array(rows).T
     deviations.bar(x, true, color="0.8", label="true")
     deviations.errorbar(x, value, 2 * std, fmt="o", ms=4, color="C0", label="identified")
     deviations.set_title("deviation from nominal [mm | mrad]")
@@ -343,20 +304,14 @@ def draw(result: DemoResult, path: str | Path) -> Path:
 
 
 def _draw_accuracy(axes: Any, result: DemoResult) -> None:
-    rows = [
-        ("before", result.before, None),
-        ("planned", result.after, result.predicted_accuracy),
-        (f"random\n(RMS of {result.random_plans})", result.random_after, result.random_predicted_accuracy),
-    ]
-    colours = ["0.6", "C0", "C1"]
-    for i, (_, achieved, predicted) in enumerate(rows):
-        axes.barh(i, 1e3 * achieved, color=colours[i], height=0.6)
-        right = 1e3 * max(achieved, predicted or 0.0)
-        axes.text(right, i, f"  {1e3 * achieved:.4f}", va="center")
+    rows = _shown_errors(result)
+    for i, (_, _, colour, achieved, predicted) in enumerate(rows):
+        axes.barh(i, achieved, color=colour, height=0.6)
+        axes.text(max(achieved, predicted or 0.0), i, f"  {achieved:.4f}", va="center")
         if predicted is not None:
             label = "predicted ρ0" if i == 1 else None
-            axes.plot([1e3 * predicted] * 2, [i - 0.38, i + 0.38], "k--", label=label)
-    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+            axes.plot([predicted] * 2, [i - 0.38, i + 0.38], "k--", label=label)
+    axes.set_yticks(range(len(rows)), [name for _, name, *_ in rows])
     axes.set_xscale("log")
     axes.margins(x=0.25)
     axes.invert_yaxis()

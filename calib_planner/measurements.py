@@ -1,8 +1,8 @@
-"""What was measured: joint angles and the points the tracker saw there."""
+"""What was measured: joint values, the points that the tracker saw there, and points that are not believed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, check_array, check_configurations
 from calib_planner.errors import InputError
+
+
+@dataclass(frozen=True)
+class RejectedPoint:
+    """A measured point that the identification did not use, or that it used and doubts.
+
+    Attributes:
+        row: Row of the measurements, from 0.
+        target: Target, from 1 as in the column names of files.
+        reason: Why, in words.
+        normalised_residual: Length of its residual in standard deviations of what it should be.
+        residual: Length of its residual [m].
+    """
+
+    row: int
+    target: int
+    reason: str
+    normalised_residual: float
+    residual: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +90,13 @@ class Measurements:
         rows = np.asarray(rows)
         std = None if self.std is None else np.asarray(self.std)[rows]
         return Measurements(self.joint_names, self.q[rows], self.p[rows], std)
+
+    def without(self, rejected: Iterable[RejectedPoint]) -> Measurements:
+        """The same rows with the rejected points marked as not measured."""
+        points = np.array(self.p)
+        for point in rejected:
+            points[point.row, point.target - 1] = np.nan
+        return Measurements(self.joint_names, self.q, points, self.std)
 
     def in_order_of(self, joint_names: Sequence[str]) -> Measurements:
         """The same with the joint columns in another order.

@@ -7,12 +7,15 @@ file or over a wire are of any length; messages show no more of them than a line
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
 MOST_CHARACTERS = 60
 """Characters of a refused value that an error shows."""
+
+MILLI_UNIT = {"m": "mm", "rad": "mrad"}
+"""Unit of a parameter → the unit of 1000 times its value, which tables for people show."""
 
 
 def length(metres: float) -> str:
@@ -91,12 +94,6 @@ def listed(names: Iterable[object], most: int = 30, *, width: int = 200, none: s
     shown = [t[:width] if t.isprintable() else ascii(t[:width]) for t in texts[:most]]
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return ", ".join(shown) + more or none
-
-
-def grouped(names: Sequence[str]) -> list[str]:
-    """Parameter names with ``base.x, base.y, …`` as ``base.*``, targets likewise; other names as they are."""
-    placed = ("base.", "target_")
-    return list(dict.fromkeys(n.partition(".")[0] + ".*" if n.startswith(placed) else n for n in names))
 
 
 def cut(text: object, most: int = 1000) -> str:

@@ -13,57 +13,30 @@ The whole in one command, with a table and a picture at the end: python3 -m cali
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
+from launch.substitutions import LaunchConfiguration
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
-NAMES = {
-    "planner": "calibration_planner",
-    "identifier": "calibration_identifier",
-    "simulator": "tracker_simulator",
+from calib_planner.ros.launching import config, namespace, node, show_in_rviz
+
+NODES = {
+    "planner": ("calibration_planner", {}),
+    "identifier": ("calibration_identifier", {"save_folder": str}),
+    "simulator": ("tracker_simulator", {"seed": int}),
 }
+"""Executable and file in config → name of the node and its own arguments."""
 
 
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` runs."""
-    own = {
-        "planner": {},
-        "identifier": {"save_folder": ParameterValue(LaunchConfiguration("save_folder"), value_type=str)},
-        "simulator": {"seed": ParameterValue(LaunchConfiguration("seed"), value_type=int)},
-    }
     arguments = [
-        DeclareLaunchArgument("robot", default_value="kuka_kr270", description="shipped robot name"),
+        DeclareLaunchArgument("robot", default_value="kuka_kr270", description="name of a shipped robot"),
         DeclareLaunchArgument("seed", default_value="0", description="seed of the hidden true errors"),
         DeclareLaunchArgument("save_folder", default_value="", description="folder for ~/save; empty = off"),
-        DeclareLaunchArgument("namespace", default_value="", description="namespace of all nodes"),
-        DeclareLaunchArgument(
-            "rviz", default_value="false", choices=["true", "false"], description="show the plan"
-        ),
+        namespace("namespace of all nodes"),
     ]
-    nodes = [
-        Node(
-            package="calib_planner",
-            executable=f"{part}_node",
-            name=name,
-            namespace=LaunchConfiguration("namespace"),
-            parameters=[
-                PathJoinSubstitution([FindPackageShare("calib_planner"), "config", f"{part}.yaml"]),
-                {"robot": LaunchConfiguration("robot")},
-                own[part],
-            ],
-            output="screen",
-        )
-        for part, name in NAMES.items()
-    ]
-    config = PathJoinSubstitution([FindPackageShare("calib_planner"), "config"])
-    rviz = Node(
-        package="rviz2",
-        executable="rviz2",
-        namespace=LaunchConfiguration("namespace"),
-        arguments=["-d", PathJoinSubstitution([config, "rviz", "planner.rviz"])],
-        remappings=[("/calibration_planner/markers", "calibration_planner/markers")],
-        condition=IfCondition(LaunchConfiguration("rviz")),
-    )
-    return LaunchDescription([*arguments, *nodes, rviz])
+    robot = {"robot": LaunchConfiguration("robot")}
+    nodes = []
+    for part, (name, kinds) in NODES.items():
+        own = {key: ParameterValue(LaunchConfiguration(key), value_type=kind) for key, kind in kinds.items()}
+        nodes.append(node(part, name, config(f"{part}.yaml"), robot, own))
+    return LaunchDescription([*arguments, *nodes, *show_in_rviz()])

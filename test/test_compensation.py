@@ -20,28 +20,28 @@ from calib_planner.robot.elements import rotation
 
 
 def pose(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """(4, 4) of the tip in the robot's own base frame."""
+    """(..., 4, 4) of the tip in the robot's own base frame; ``q`` (..., joints)."""
     out = np.eye(4)
     for e in robot.elements[9:]:
-        amount = e.sign * (e.value + (0 if e.joint is None else q[e.joint]))
-        step = np.eye(4)
+        amount = e.sign * (e.value + (0 if e.joint is None else q[..., e.joint]))
+        step = np.zeros((*np.shape(amount), 4, 4)) + np.eye(4)
         if e.is_rotation:
-            step[:3, :3] = rotation(e.axis, amount)
+            a, b = (e.axis + 1) % 3, (e.axis + 2) % 3
+            step[..., a, a] = step[..., b, b] = np.cos(amount)
+            step[..., b, a] = np.sin(amount)
+            step[..., a, b] = -np.sin(amount)
         else:
-            step[e.axis, 3] = amount
+            step[..., e.axis, 3] = amount
         out = out @ step
     return out
 
 
 def pose_errors(nominal: Robot, true: Robot, targets: np.ndarray, told: np.ndarray) -> np.ndarray:
     """(N, 2) distance [m] and angle [rad] between the nominal tip and the true one."""
-    found = []
-    for q, q_told in zip(targets, told, strict=True):
-        a, b = pose(nominal, q), pose(true, q_told)
-        # |R - 1| of a rotation by θ is 2√2 sin(θ/2)
-        angle = 2 * np.arcsin(min(1.0, np.linalg.norm(a[:3, :3] - b[:3, :3]) / np.sqrt(8)))
-        found.append([np.linalg.norm(a[:3, 3] - b[:3, 3]), angle])
-    return np.array(found)
+    apart = (pose(nominal, targets) - pose(true, told))[:, :3]
+    # |R - 1| of a rotation by θ is 2√2 sin(θ/2)
+    turned = np.linalg.norm(apart[:, :, :3], axis=(1, 2)) / np.sqrt(8)
+    return np.stack([np.linalg.norm(apart[:, :, 3], axis=1), 2 * np.arcsin(np.minimum(turned, 1.0))], axis=1)
 
 
 def deviated(robot: Robot, seed: int = 0, size: float = 1e-3) -> Robot:

@@ -53,12 +53,12 @@ def imported(folder: Path) -> set[str]:
                 found |= {name.name.split(".")[0] for name in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 found.add((node.module or "").split(".")[0])
-    return found - set(sys.stdlib_module_names) - {"calib_planner"}
+    return found - set(sys.stdlib_module_names) - {"calib_planner", "calib_planner_paper"}
 
 
 def launched() -> set[str]:
     """Other packages whose nodes a launch file may start."""
-    files = (ROOT / "launch").glob("*.py")
+    files = [*(ROOT / "launch").glob("*.py"), PACKAGE / "ros" / "launching.py"]
     keywords = [k for path in files for k in ast.walk(ast.parse(path.read_text())) if isinstance(k, ast.keyword)]
     found = {k.value.value for k in keywords if k.arg == "package" and isinstance(k.value, ast.Constant)}
     return {str(name) for name in found} - {"calib_planner"}
@@ -78,7 +78,7 @@ def setup_call() -> dict[str, Any]:
 
 
 def test_package_xml_names_all_that_is_imported_or_launched_and_nothing_else() -> None:
-    needed = imported(PACKAGE) | imported(ROOT / "launch") | launched()
+    needed = imported(PACKAGE) | imported(ROOT / "paper") | imported(ROOT / "launch") | launched()
     assert needed <= ROS | set(KEYS) | EXTRAS, "unknown: find its rosdep key, or make it an extra"
     assert set(keys("exec_depend")) == {KEYS.get(name, name) for name in needed - EXTRAS}
 
@@ -105,7 +105,8 @@ def test_setup_py_and_package_xml_agree() -> None:
 
 def test_every_node_is_an_executable() -> None:
     scripts = dict(text.split(" = ") for text in setup_call()["entry_points"]["console_scripts"])
-    nodes = {p.stem: f"calib_planner.ros.{p.stem}:main" for p in (PACKAGE / "ros").glob("*_node.py")}
+    parts = {p.stem for p in (PACKAGE / "ros" / "nodes").glob("*.py")} - {"__init__"}
+    nodes = {f"{part}_node": f"calib_planner.ros.nodes.{part}:main" for part in parts}
     assert {k: v for k, v in scripts.items() if k.endswith("_node")} == nodes
     for target in scripts.values():
         module, _, function = target.partition(":")

@@ -47,7 +47,7 @@ ROOMS: dict[str, str] = {
 """Room → the rooms that it may use besides ``GROUND``, in the order of the house: each only rooms above it."""
 FRONT = {"": "doors errors measurements planning identification io", "__main__": "cli"}
 """The package's own door, which resolves names when they are first used, and ``python -m calib_planner``."""
-PAPER_USES = "robot tracker planning identification simulation io cli"
+PAPER_USES = "robot tracker planning identification simulation io report cli"
 WITHOUT_A_DOOR = ("ros",)
 """A node that starts pays only for what it needs: other programs import the files of this room one by one."""
 
@@ -184,8 +184,8 @@ LEFT_DEEP = {"campaign_faults.py": 1, "pools.py": 4}
 
 
 def examples_and_benches() -> Iterator[tuple[str, str]]:
-    """(where, Python text) of the benches and of every example of README and docs."""
-    for path in sorted((ROOT / "bench").glob("*.py")):
+    """(where, Python text) of the benches, of the tools and of every example of README and docs."""
+    for path in sorted([*(ROOT / "bench").glob("*.py"), *(ROOT / "tools").rglob("*.py")]):
         yield path.name, path.read_text(encoding="utf-8")
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         for number, text in enumerate(re.findall(r"^```python\n(.*?)^```$", path.read_text(), re.DOTALL | re.M)):
@@ -310,29 +310,26 @@ EXEMPT = ("identification",)
 LEFT_NAMES = {
     "robot": 11,
     "acquisition": 22,
-    "planning": 162,
+    "planning": 160,
     "campaign": 40,
     "simulation": 3,
-    "io": 32,
-    "demo": 3,
-    "cli": 17,
-    "ros": 37,
-    "paper": 10,
+    "io": 21,
+    "cli": 16,
+    "ros": 32,
 }
 LEFT_TEXT = {
     "errors": 1,
     "robot": 3,
     "tracker": 3,
     "acquisition": 3,
-    "planning": 118,
+    "planning": 116,
     "compensation": 2,
     "campaign": 19,
     "simulation": 5,
-    "io": 14,
+    "io": 10,
     "cli": 7,
     "ros": 14,
-    "paper": 4,
-    "docs": 71,
+    "docs": 68,
     "msg_defs": 7,
     "config": 2,
 }

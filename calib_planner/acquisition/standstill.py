@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -26,50 +26,42 @@ from numpy.typing import ArrayLike
 
 from calib_planner.acquisition.clocks import ClockOffsets
 from calib_planner.acquisition.stamps import StampOrder
-from calib_planner.arrays import FloatArray, IntArray, check_array, check_count, check_number, frozen
+from calib_planner.arrays import FloatArray, IntArray, check_array, check_count, check_ranges, frozen, ranged
 from calib_planner.errors import InputError
 from calib_planner.units import length, milliseconds
 
 NANO = 1_000_000_000
+MOST_SAMPLES = 20_000
+"""Samples of one stream that a standstill holds at most."""
 IN_A_ROW = 50
 """Unusable messages in a row that are worth a rejection of their own."""
 
 
 @dataclass(frozen=True)
 class StandstillSettings:
-    """What counts as standing still.
+    """What counts as standing still, with units and ranges."""
 
-    Attributes:
-        joint_tolerance: Largest range of a joint [rad | m].
-        point_tolerance: Largest range of a coordinate of a point [m].
-        settle: Left out after the joints came to rest [s].
-        duration: Shortest interval averaged [s].
-        samples: Points of every target wanted.
-        minimum_samples: Points of a target needed to use it at all.
-        patience: After this long at rest (beyond ``settle``) take what there is [s].
-        gap: Longest pause between messages of a stream [s].
-        window: How late a message may come after a later one of its stream [s].
-        skew: How far the streams' stamps may be apart [s].
-    """
-
-    joint_tolerance: float = 1e-4
-    point_tolerance: float = 3e-4
-    settle: float = 0.1
-    duration: float = 0.4
-    samples: int = 20
-    minimum_samples: int = 5
-    patience: float = 2.0
-    gap: float = 0.25
-    window: float = 0.1
-    skew: float = 0.5
+    joint_tolerance: float = ranged(1e-4, "largest range of a joint during a standstill", "rad or m", 1e-9, 1.0)
+    point_tolerance: float = ranged(
+        3e-4,
+        "largest range of a coordinate during a standstill, about ten times sigma",
+        "m",
+        1e-7,
+        1.0,
+    )
+    settle: float = ranged(0.1, "time left out after joints and points came to rest", "s", 0.0, 60.0)
+    duration: float = ranged(0.4, "shortest interval that is averaged", "s", 0.01, 600.0)
+    samples: int = ranged(20, "points of every target that are wanted", "", 1, MOST_SAMPLES)
+    minimum_samples: int = ranged(5, "points of a target that are needed to use it", "", 1, MOST_SAMPLES)
+    patience: float = ranged(
+        2.0, "time at rest, beyond settle, after which fewer points than wanted are used", "s", 0.01, 600.0
+    )
+    gap: float = ranged(0.25, "longest pause between two messages of a stream", "s", 1e-3, 60.0)
+    window: float = ranged(0.1, "how late a message may come after a later one of its stream", "s", 0.0, 60.0)
+    skew: float = ranged(0.5, "largest difference between the stamps of the streams", "s", 1e-3, 60.0)
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if f.name in ("samples", "minimum_samples"):
-                check_count(f.name, getattr(self, f.name), high=MOST_SAMPLES)
-                continue
-            closed = f.name in ("settle", "window")
-            check_number(f.name, getattr(self, f.name), low=0.0, high=3600.0, low_open=not closed)
+        check_ranges(self, StandstillSettings)
         if self.minimum_samples > self.samples:
             raise InputError("minimum_samples", self.minimum_samples, f"at most samples = {self.samples}")
 
@@ -366,9 +358,6 @@ def _ns(seconds: float) -> int:
 
 
 # ── The samples of one stream since it came to rest; one that breaks the rest begins a new one ──────────────
-
-MOST_SAMPLES = 20_000
-"""Samples of one stream kept at most."""
 
 
 @dataclass

@@ -208,7 +208,7 @@ def contradicted(estimate: Estimate, noise: Noise, held_out: Measurements) -> bo
     else:
         robot = estimate.calibrated
         columns = np.ascontiguousarray(robot.jacobian(q)).reshape(*held_out.p.shape, -1)
-        covariance = columns @ estimate.covariance @ np.swapaxes(columns, 2, 3)
+        covariance = columns @ estimate.fit.covariance @ np.swapaxes(columns, 2, 3)
         covariance = covariance + estimate.noise.discrepancy_covariance(robot, q)
     predicted = estimate.positions(q)
     distance = normalised(held_out.p - predicted, covariance + noise.covariance(predicted))[seen]
@@ -221,7 +221,7 @@ def without_estimate(outcome: str, message: str) -> Verdict:
 
 
 def _predicted(estimate: Estimate, required: float) -> Reason:
-    worst = float(np.max(estimate.predicted_accuracy_per_test_pose))
+    worst = float(np.max(estimate.accuracy.predicted))
     level = "PASS" if worst <= required else "FAIL"
     said = length(worst) if np.isfinite(worst) else "nothing"
     text = f"predicted at the worst test pose: {said} where {length(required)} are required"

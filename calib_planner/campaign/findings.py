@@ -83,15 +83,15 @@ class Finding:
     @property
     def accuracy(self) -> float:
         """Error predicted at the worst test pose [m]; infinite where the data are blind."""
-        return float(np.max(self.estimate.predicted_accuracy_per_test_pose))
+        return float(np.max(self.estimate.accuracy.predicted))
 
     @property
     def floor_per_test_pose(self) -> FloatArray:
         """(K,) what more measurements leave of it, root mean square distance [m]."""
         learnt = self.estimate.transmission
         if learnt is None:
-            return self.estimate.discrepancy_per_test_pose
-        left = learnt.remainder(self.estimate.test_poses)
+            return self.estimate.accuracy.discrepancy
+        left = learnt.remainder(self.estimate.accuracy.test_poses)
         return np.asarray(np.sqrt(np.einsum("ktii->kt", left).mean(axis=1)))
 
     @property
@@ -102,16 +102,13 @@ class Finding:
     @property
     def surely(self) -> float:
         """The part of ``floor`` that it is at least: a variance from ν residuals is known to √(2/ν)."""
-        freedom = max(self.estimate.chi_square.freedom, 1)
+        freedom = max(self.estimate.residuals.chi_square.freedom, 1)
         return self.floor * float(np.sqrt(max(1.0 - 2.0 * np.sqrt(2.0 / freedom), 0.0)))
 
     @property
     def used(self) -> Measurements:
         """The measurements that were believed."""
-        points = np.array(self.asked.data.p)
-        for point in self.estimate.rejected:
-            points[point["row"], point["target"] - 1] = np.nan
-        data = Measurements(self.asked.data.joint_names, self.asked.data.q, points)
+        data = self.asked.data.without(self.estimate.points.rejected)
         return data.select(np.flatnonzero(data.seen.any(axis=1)))
 
     @property
@@ -144,14 +141,17 @@ def find(problem: CampaignProblem, data: Measurements) -> Finding:
         return _rescaled(problem, data, found)
     if found.noise.scaled > 1:
         return _rescaled(problem, data, found)
-    if found.chi_square.freedom >= FEWEST_SPARE and found.chi_square.probability > 1.0 - DOUBT:
+    if (
+        found.residuals.chi_square.freedom >= FEWEST_SPARE
+        and found.residuals.chi_square.probability > 1.0 - DOUBT
+    ):
         return _rescaled(problem, data, found)
     return Finding(asked, found, AS_STATED, stated)
 
 
 def _rescaled(problem: CampaignProblem, data: Measurements, found: Estimate) -> Finding:
     """All of the scatter taken as noise."""
-    chi = found.chi_square
+    chi = found.residuals.chi_square
     factor = found.noise.scaled * float(np.sqrt(max(chi.value / max(chi.freedom, 1), 1e-12)))
     noise = Scaled(problem.instrument, factor)
     asked = _asked(problem, data, noise)
@@ -160,7 +160,7 @@ def _rescaled(problem: CampaignProblem, data: Measurements, found: Estimate) -> 
 
 def _lack_of_fit(found: Estimate) -> bool:
     """Whether the residuals are more than repetitions explain; see the module."""
-    levels, chi = found.noise, found.chi_square
+    levels, chi = found.noise, found.residuals.chi_square
     if not levels.repeat_freedom or not levels.repeatability > 0 or levels.discrepancy <= 0:
         return False
     in_units_of_repetitions = chi.value * (levels.measurement / levels.repeatability) ** 2
@@ -213,9 +213,9 @@ def outcome_of(state: CampaignState, found: Finding | None) -> tuple[str, str]:
 def ready(state: CampaignState, found: Finding) -> bool:
     """Whether there is enough to judge by."""
     apart = different(found.used)
-    spare = 3 * int(apart.seen.sum()) - found.estimate.rank
+    spare = 3 * int(apart.seen.sum()) - found.estimate.observability.rank
     enough = len(apart) >= state.problem.minimum and spare >= FEWEST_SPARE
-    return enough and found.estimate.status != "not_converged"
+    return enough and found.estimate.fit.status != "not_converged"
 
 
 def limited(state: CampaignState, found: Finding) -> bool:
@@ -234,7 +234,7 @@ def different(data: Measurements) -> Measurements:
 def forecast(found: Finding, required: float) -> float:
     """Measurements still needed; infinite where the floor is above what is required."""
     floor = found.floor_per_test_pose
-    total = found.estimate.predicted_accuracy_per_test_pose
+    total = found.estimate.accuracy.predicted
     room = required**2 - floor**2
     if not np.isfinite(total).all() or (room <= 0).any():
         return float("inf")

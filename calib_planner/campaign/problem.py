@@ -289,7 +289,7 @@ class CampaignResult:
         """Error predicted at the worst test pose [m]; infinite without an estimate."""
         if self.estimate is None:
             return float("inf")
-        return float(self.estimate.predicted_accuracy_per_test_pose.max())
+        return float(self.estimate.accuracy.predicted.max())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers; non-finite numbers become ``None``."""

@@ -1,12 +1,22 @@
 """The command line ``calib-planner``: arguments in, one library call, result out. No ROS.
 
-``main`` runs a command. The other names are for commands of other packages, such as the paper's; they are
-imported when they are first used, so that ``--help`` does not pay for them.
+``main`` runs a command, ``parser`` is the parser of all commands. The other names are for commands of other
+packages, such as the paper's; they are imported when they are first used, so that ``--help`` does not pay for
+them.
 """
 
 from typing import TYPE_CHECKING
 
-from calib_planner.cli.main import main
+from calib_planner.cli.main import (
+    CLOSED_PIPE,
+    DONE,
+    EPILOG,
+    FAILED,
+    INTERRUPTED,
+    WRONG_USAGE,
+    main,
+    parser,
+)
 from calib_planner.doors import lazy_door
 
 if TYPE_CHECKING:
@@ -14,5 +24,7 @@ if TYPE_CHECKING:
     from calib_planner.cli.terminal import Terminal
 
 __getattr__, __dir__, __all__ = lazy_door(
-    __name__, {"arguments": "Commands add_command add_seed", "terminal": "Terminal"}, "main"
+    __name__,
+    {"arguments": "Commands add_command add_seed", "terminal": "Terminal"},
+    *("CLOSED_PIPE", "DONE", "EPILOG", "FAILED", "INTERRUPTED", "WRONG_USAGE", "main", "parser"),
 )

@@ -40,13 +40,20 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.terminal import Terminal
-from calib_planner.demo import independent_seeds
 from calib_planner.errors import InputError
 from calib_planner.identification import AUTOMATIC
 from calib_planner.io import read_measurements, write_configurations, write_estimate, write_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.simulation import Faults, SimulatedCell, Stand, World, random_deviations, simulated
+from calib_planner.simulation import (
+    Faults,
+    SimulatedCell,
+    Stand,
+    World,
+    independent_seeds,
+    random_deviations,
+    simulated,
+)
 from calib_planner.units import counted, length
 
 DESCRIPTION = """Plan a batch, measure it, identify, plan the rest from what was measured, until the accuracy is

@@ -6,7 +6,6 @@ Long lists are cut; the files and ``--json`` hold all of it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -15,6 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from calib_planner.identification import Estimate, NoiseLevels, Validation
+from calib_planner.measurements import RejectedPoint
+from calib_planner.robot import is_nuisance
 from calib_planner.units import length
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
@@ -42,22 +43,19 @@ def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], s
     _show_verdict(estimate, console)
     console.print(_distances(estimate))
     console.print(_noise(estimate), soft_wrap=True)
-    if len(estimate.test_poses):
+    if len(estimate.accuracy.test_poses):
         console.print(_accuracy(estimate), soft_wrap=True)
     console.print(_counts(estimate), soft_wrap=True)
     console.print(_parameters(estimate))
-    combinations = [f"{n}: {c}" for n, c in zip(estimate.held, estimate.unidentifiable, strict=True)]
+    combinations = [
+        f"{n}: {c}"
+        for n, c in zip(estimate.observability.fixed, estimate.observability.unidentifiable, strict=True)
+    ]
     _show_list(console, "Held at nominal; these combinations cannot be seen:", combinations)
-    _show_list(console, "Decided by the prior; the data cannot see:", estimate.resolved_by_prior)
-    _show_list(console, "Hardly seen by the data, weakest first:", estimate.nearly_dependent)
-    _show_points(console, "Rejected", estimate.rejected, where)
-    _show_points(console, "Used, but far off", estimate.suspects, where)
-
-
-def grouped(names: Sequence[str]) -> list[str]:
-    """``base.x, base.y, …`` as ``base.*``, targets likewise; other names as they are."""
-    placed = ("base.", "target_")
-    return list(dict.fromkeys(n.partition(".")[0] + ".*" if n.startswith(placed) else n for n in names))
+    _show_list(console, "Decided by the prior; the data cannot see:", estimate.observability.resolved_by_prior)
+    _show_list(console, "Hardly seen by the data, weakest first:", estimate.observability.nearly_dependent)
+    _show_points(console, "Rejected", estimate.points.rejected, where)
+    _show_points(console, "Used, but far off", estimate.points.suspects, where)
 
 
 # ── is it good? ──────────────────────────────────────────────────────────────────────────────────────
@@ -81,10 +79,10 @@ def _distances(estimate: Estimate) -> Table:
     table.add_column("points", no_wrap=True)
     for heading in HEADINGS:
         table.add_column(heading, justify="right")
-    before, after = estimate.residual_before, estimate.residual_after
+    before, after = estimate.residuals.before, estimate.residuals.after
     label = "fitted" if estimate.transmission is None else "fitted, geometry"
     cells = [_mm(before.mean), _mm(after.mean), "", _mm(after.rms), _mm(after.max)]
-    table.add_row(label, str(estimate.used), *cells)
+    table.add_row(label, str(estimate.points.used), *cells)
     for found in (estimate.cross_validation, estimate.validation):
         if found is not None:
             label = f"left out, {found.folds} folds" if found.folds else "held out"
@@ -128,14 +126,14 @@ def _discrepancy(noise: NoiseLevels) -> str:
 
 
 def _accuracy(estimate: Estimate) -> str:
-    per = estimate.predicted_accuracy_per_test_pose
+    per = estimate.accuracy.predicted
     shown = ", ".join(length(v) for v in per[:MOST_POSES]) + _more(len(per), MOST_POSES)
     text = f"Predicted error at the test pose{'s' if len(per) > 1 else ''}: {shown}"
-    own, rest = estimate.parameter_accuracy_per_test_pose, estimate.discrepancy_per_test_pose
+    own, rest = estimate.accuracy.parameters, estimate.accuracy.discrepancy
     if np.isfinite(own).all():
         parts = [length(float(np.sqrt(np.mean(v**2)))) for v in (own, rest)]
         text += f" (parameters, ρ0: {parts[0]}; beyond the model: {parts[1]})"
-    required = estimate.required_accuracy
+    required = estimate.accuracy.required
     return text + (f"; required: {length(required)}" if np.isfinite(required) else "")
 
 
@@ -143,12 +141,11 @@ def _accuracy(estimate: Estimate) -> str:
 
 
 def _counts(estimate: Estimate) -> str:
-    text = (
-        f"{estimate.status}: {estimate.rank} of {len(estimate.parameters)} parameters from {estimate.used} points"
-    )
-    if estimate.used < estimate.measurements:
-        text += f" of {estimate.measurements}"
-    return text + (f", prior: {estimate.prior}." if estimate.prior else ", no prior.")
+    fit, sight, points = estimate.fit, estimate.observability, estimate.points
+    text = f"{fit.status}: {sight.rank} of {len(fit.parameters)} parameters from {points.used} points"
+    if points.used < points.measured:
+        text += f" of {points.measured}"
+    return text + (f", prior: {sight.prior}." if sight.prior else ", no prior.")
 
 
 def _parameters(estimate: Estimate) -> Table:
@@ -157,11 +154,11 @@ def _parameters(estimate: Estimate) -> Table:
         left = heading in ("parameter", "unit", "remark")
         table.add_column(heading, justify="left" if left else "right")
     remarks = _remarks(estimate)
-    columns = (estimate.nominal, estimate.values, estimate.deviations, estimate.std)
-    for name, unit, *numbers in zip(estimate.parameters, estimate.units, *columns, strict=True):
+    columns = (estimate.fit.nominal, estimate.fit.values, estimate.fit.deviations, estimate.fit.std)
+    for name, unit, *numbers in zip(estimate.fit.parameters, estimate.fit.units, *columns, strict=True):
         label, factor = SHOWN[unit]
         nominal, value, deviation, std = (factor * v for v in numbers)
-        held = name in estimate.held
+        held = name in estimate.observability.fixed
         change = ["", ""] if held else [_signed(deviation), f"{std:.4f}"]
         table.add_row(
             name,
@@ -172,15 +169,15 @@ def _parameters(estimate: Estimate) -> Table:
             remarks.get(name, ""),
             style="dim" if held else "",
         )
-    if any(n.startswith(("base.", "target_")) for n in estimate.parameters):
+    if any(map(is_nuisance, estimate.fit.parameters)):
         table.caption = "nominal of an unknown base or target: its closed-form start"
     return table
 
 
 def _remarks(estimate: Estimate) -> dict[str, str]:
     """Held, or with which other parameter most strongly correlated."""
-    found = dict.fromkeys(estimate.held, "held")
-    for a, b, correlation in estimate.correlations:  # strongest first
+    found = dict.fromkeys(estimate.observability.fixed, "held")
+    for a, b, correlation in estimate.fit.correlations:  # strongest first
         for one, other in ((a, b), (b, a)):
             found.setdefault(one, f"correlated {correlation:+.3f} with {other}")
     return found
@@ -196,15 +193,15 @@ def _show_list(console: Console, title: str, lines: Sequence[str]) -> None:
 
 
 def _show_points(
-    console: Console, title: str, points: Sequence[dict[str, Any]], where: Callable[[int], str] | None
+    console: Console, title: str, points: Sequence[RejectedPoint], where: Callable[[int], str] | None
 ) -> None:
     """Points with reasons, farthest first."""
     if not points:
         return
     console.print(f"{title}: {len(points)} points, farthest first (rows count from 0)")
-    for point in sorted(points, key=lambda p: -p["normalised_residual"])[:MOST_POINTS]:
-        place = f" ({where(point['row'])})" if where else ""
-        console.print(f"  row {point['row']}, target {point['target']}{place}: {point['reason']}", soft_wrap=True)
+    for point in sorted(points, key=lambda p: -p.normalised_residual)[:MOST_POINTS]:
+        place = f" ({where(point.row)})" if where else ""
+        console.print(f"  row {point.row}, target {point.target}{place}: {point.reason}", soft_wrap=True)
     if len(points) > MOST_POINTS:
         console.print(f" {_more(len(points), MOST_POINTS)}")
 

@@ -26,7 +26,7 @@ from calib_planner.cli.arguments import (
     load_robot,
     test_poses,
 )
-from calib_planner.cli.estimate_table import grouped, show_estimate
+from calib_planner.cli.estimate_table import show_estimate
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, NotEnoughDataError
 from calib_planner.identification import (
@@ -56,7 +56,7 @@ from calib_planner.io import (
 )
 from calib_planner.measurements import Measurements
 from calib_planner.report import Provenance, provenance, write_report
-from calib_planner.robot import Robot, not_in_origins
+from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
 
 EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \\
@@ -98,13 +98,13 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     held_out = [_held_out(path, robot, args, terminal) for path in args.validate or ()]
     with terminal.working("identifying"):
         estimate = _estimate(problem, held_out, args)
-    settled = estimate.status != "not_converged"
+    settled = estimate.fit.status != "not_converged"
     written = write_outputs(args, problem, estimate) if settled else {}
     sources = {"data": [{"file": s.path, "rows": len(s.data)} for s in rows.sources]}
     result = estimate.to_dict() | plain(placement(estimate)) | sources | written
     terminal.answer(result, partial(show_estimate, estimate, where=rows.where))
     if not settled:
-        raise CalibPlannerError(estimate.message + (" Nothing was written." if _asked(args) else ""))
+        raise CalibPlannerError(estimate.fit.message + (" Nothing was written." if _asked(args) else ""))
     tell_outputs(args, written, terminal)
 
 
@@ -127,7 +127,7 @@ def _problem(robot: Robot, rows: Rows, args: argparse.Namespace, terminal: Termi
 
 def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args: argparse.Namespace) -> Estimate:
     estimate = identify(problem)
-    if estimate.status == "not_converged":
+    if estimate.fit.status == "not_converged":
         return estimate
     if held_out:
         estimate = validate(problem, estimate, held_out, args.validate_target_from)

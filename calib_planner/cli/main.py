@@ -34,6 +34,10 @@ COMMANDS = {
     "reproduce": ("calib_planner_paper.command", "the paper's tables and figures, computed again"),
 }
 """Name → module, and what the command does in a few words."""
+NO_PAPER = (
+    "the package calib_planner_paper is not installed; it comes with the source of calib_planner, "
+    "so install that (pip install .) or put its folder paper/ on PYTHONPATH"
+)
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, CLOSED_PIPE = 0, 1, 2, 130, 141
 
 EPILOG = """\
@@ -102,7 +106,7 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
         except ModuleNotFoundError as error:
             if error.name != "calib_planner_paper":
                 raise
-            top.exit(FAILED, f"calib-planner {name}: install calib_planner_paper, see the folder paper/\n")
+            top.exit(FAILED, f"calib-planner {name}: {NO_PAPER}\n")
     return top
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,12 +25,12 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.identify import TYPICAL
-from calib_planner.cli.sheet import make_folder, robot_pace, write_sheet
+from calib_planner.cli.sheet import robot_pace, write_sheet
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
 from calib_planner.identification import typical_prior
 from calib_planner.io import (
-    URDF_SUFFIXES,
+    make_folder,
     read_configurations,
     read_measurements,
     read_prior,
@@ -52,6 +51,7 @@ from calib_planner.planning import (
     plan_for_accuracy,
     plan_sheet,
     split_budget,
+    usual_discrepancy,
 )
 from calib_planner.planning import plan as find_plan
 from calib_planner.robot import Robot
@@ -249,6 +249,11 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
     if poses is None and criterion in POSE_CRITERIA:
         wanted = f"{len(robot.joint_names)} numbers: {', '.join(robot.joint_names)}"
         raise InputError("--test-pose", "none", wanted, "give --test-pose or --test-path")
+    candidates, compound = _candidates(args, robot), _compound(getattr(args, "compound", []))
+    wanted = getattr(args, "discrepancy", "off")
+    discrepancy = ModelDiscrepancy() if wanted == "on" else None
+    if wanted == "auto":
+        discrepancy = usual_discrepancy(robot, criterion, candidates, compound)
     return PlanProblem(
         robot=robot,
         test_poses=poses,
@@ -257,25 +262,15 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         weights=args.weights,
         **conditions(args, robot),
         criterion=criterion,
-        compound=_compound(getattr(args, "compound", [])),
+        compound=compound,
         repeatability=args.configuration_sigma,
-        discrepancy=_discrepancy(args, robot),
+        discrepancy=discrepancy,
         prior=PlanPrior(std=_prior(args.prior, robot), measured=_measured(args, robot)),
         search=Search(
             general_weight=args.general_weight, starts=args.starts, seed=args.seed, time_limit=args.time_limit
         ),
-        candidates=_candidates(args, robot),
+        candidates=candidates,
     )
-
-
-def _discrepancy(args: argparse.Namespace, robot: Robot) -> ModelDiscrepancy | None:
-    """What a real robot has beyond its geometric model, where that is asked for or to be expected."""
-    wanted = getattr(args, "discrepancy", "off")
-    if wanted == "auto":
-        plain = args.criterion == "test_pose" and not args.compound and not args.repeat_candidates
-        real = Path(robot.source).suffix.lower() in URDF_SUFFIXES
-        wanted = "on" if real and plain and args.candidates is not None else "off"
-    return ModelDiscrepancy() if wanted == "on" else None
 
 
 def _compound(words: list[str]) -> dict[str, float]:

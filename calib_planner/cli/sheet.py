@@ -19,6 +19,7 @@ from calib_planner.io import (
     URDF_SUFFIXES,
     WORDS,
     angle_factors,
+    make_folder,
     read_constraints,
     read_instrument,
     read_plan,
@@ -113,21 +114,6 @@ def write_sheet(folder: str, sheet: PlanSheet, terminal: Terminal, field: str = 
     if len(written) < len(FILES):
         terminal.note("No trajectory was written: not every stop is reachable.")
     return list(written)
-
-
-def make_folder(folder: str, field: str = "--output") -> Path:
-    """The folder, made if it is not there.
-
-    Raises:
-        InputError: It cannot be made; names ``field``.
-    """
-    target = Path(folder).expanduser()
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = f"{folder} ({error.strerror})"
-        raise InputError(field, reason, "a folder that can be made", "choose another") from None
-    return target
 
 
 def robot_pace(robot: Robot, dwell: float = DWELL, share: float = SHARE) -> Pace:

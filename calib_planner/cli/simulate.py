@@ -20,11 +20,16 @@ from calib_planner.cli.arguments import (
     load_robot,
 )
 from calib_planner.cli.terminal import Terminal
-from calib_planner.demo import independent_seeds
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io import measurements_text, read_plan, read_plan_csv, write_measurements
 from calib_planner.robot import Robot
-from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
+from calib_planner.simulation import (
+    ANGLE_ERROR,
+    LENGTH_ERROR,
+    SimulatedCell,
+    independent_seeds,
+    random_deviations,
+)
 
 EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7 --output measured.csv
   calib-planner identify --robot kuka_kr270 --data measured.csv"""

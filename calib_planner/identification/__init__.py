@@ -3,12 +3,15 @@
 from calib_planner.identification.checks import FEWEST, SIGNIFICANT, check_units
 from calib_planner.identification.estimate import (
     LEVELS,
+    STATUS,
     STRONG,
+    Accuracy,
     ChiSquare,
     Estimate,
     Reason,
     Validation,
     Verdict,
+    without_noise,
 )
 from calib_planner.identification.evidence import fit_placement
 from calib_planner.identification.least_squares import SAME_JOINT, configuration_labels
@@ -25,3 +28,4 @@ from calib_planner.identification.robust import normalised
 from calib_planner.identification.solver import identify, start_robot
 from calib_planner.identification.transmission import JointCorrections, phases
 from calib_planner.identification.validation import cross_validate, validate
+from calib_planner.identification.verdict import RULES, Rule, judge, judged

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +10,23 @@ from numpy.typing import NDArray
 from calib_planner.arrays import FloatArray
 from calib_planner.identification.checks import Disturbance, HiddenErrors, Structure, copied_rows, explain
 from calib_planner.identification.estimate import (
-    STATUS,
+    Accuracy,
     ChiSquare,
+    Diagnostics,
     Estimate,
+    Observability,
+    ParameterFit,
+    Points,
+    Residuals,
     residual_statistics,
 )
 from calib_planner.identification.least_squares import Equations, Fit, Motion, gauss_newton, point_whitening
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
 from calib_planner.identification.transmission import Transmission
-from calib_planner.measurements import Measurements
-from calib_planner.robot import Identifiability, Robot, describe
+from calib_planner.identification.verdict import judged
+from calib_planner.measurements import Measurements, RejectedPoint
+from calib_planner.robot import Identifiability, Robot, describe, is_nuisance
 from calib_planner.units import length
 
 BLIND = 1e-5
@@ -61,72 +66,68 @@ class Evidence:
 
 
 def estimate_of(evidence: Evidence) -> Estimate:
-    """The answer."""
+    """The answer, with its verdict."""
     robot, fit, data = evidence.robot, evidence.fit, evidence.problem.data
-    names, parameters = robot.parameter_names, robot.parameters
-    kept = list(fit.kept)
+    names, use = robot.parameter_names, evidence.equations.use
+    free = list(fit.kept)
     std = np.full(len(names), np.nan)
-    std[kept] = np.sqrt(np.diag(evidence.covariance)[kept])
+    std[free] = np.sqrt(np.diag(evidence.covariance)[free])
     predicted = evidence.equations.motion.at(fit.deviations)[0]
     residuals = data.p - predicted
-    use = evidence.equations.use
-    before = _placed_positions(evidence)
-    held = [i for i in evidence.identifiability.held if i not in evidence.resolved]
+    before = data.p - _placed_positions(evidence)
+    fixed = [i for i in evidence.identifiability.held if i not in evidence.resolved]
     combination = dict(zip(evidence.identifiability.held, evidence.identifiability.combinations, strict=True))
-    status = "rank_deficient" if held else "ok"
-    if not fit.converged:
-        status = "not_converged"
-    poses = evidence.problem.test_pose_array
-    precision, discrepancy = _accuracy(evidence, poses)
-    levels = evidence.levels
-    required = evidence.problem.required_accuracy
-    required = float("nan") if required is None else required
-    return Estimate(
-        robot=robot.name,
-        joint_names=robot.joint_names,
-        parameters=names,
-        units=tuple(p.unit for p in parameters),
-        nominal=np.array([p.nominal for p in parameters]),
-        deviations=fit.deviations,
-        std=std,
-        covariance=evidence.covariance,
-        rank=len(kept),
-        unidentifiable=tuple(combination[i] for i in held),
-        held=tuple(names[i] for i in held),
-        resolved_by_prior=tuple(combination[i] for i in evidence.resolved),
-        nearly_dependent=_nearly_dependent(fit, names),
-        prior="" if evidence.problem.prior is None else evidence.problem.prior.source,
-        measurements=int(data.seen.sum()),
-        used=int(use.sum()),
-        rejected=_rejected(evidence, predicted),
-        suspects=_suspects(evidence, predicted),
-        copies=copied_rows(data),
-        sigma=float(np.sqrt(levels.measurement**2 + levels.discrepancy**2)),
-        sigma_estimate=_scatter(evidence, residuals),
-        noise=levels,
-        chi_square=ChiSquare(evidence.chi_square, evidence.freedom),
-        residual_before=residual_statistics(distances((data.p - before)[use])),
-        residual_after=residual_statistics(distances(residuals[use])),
-        residuals=residuals,
-        normalised_residuals=evidence.normalised,
-        gate=evidence.gate,
-        test_poses=poses,
-        parameter_accuracy_per_test_pose=precision,
-        discrepancy_per_test_pose=discrepancy,
-        structure=evidence.structure,
-        disturbances=evidence.disturbances,
-        moved_since=evidence.moved_since,
-        transmission=evidence.transmission,
-        hidden=evidence.hidden,
-        starts=evidence.starts,
-        agreeing_starts=evidence.agreeing,
-        iterations=fit.iterations,
-        status=status,
-        message=STATUS[status],
-        seconds=evidence.seconds,
+    status = "not_converged" if not fit.converged else "rank_deficient" if fixed else "ok"
+    estimate = Estimate(
         calibrated=robot.with_deviations(dict(zip(names, fit.deviations, strict=True))),
-        required_accuracy=required,
+        transmission=evidence.transmission,
+        fit=ParameterFit(
+            parameters=names,
+            units=tuple(p.unit for p in robot.parameters),
+            nominal=np.array([p.nominal for p in robot.parameters]),
+            deviations=fit.deviations,
+            std=std,
+            covariance=evidence.covariance,
+            iterations=fit.iterations,
+            status=status,
+        ),
+        observability=Observability(
+            rank=len(free),
+            fixed=tuple(names[i] for i in fixed),
+            unidentifiable=tuple(combination[i] for i in fixed),
+            resolved_by_prior=tuple(combination[i] for i in evidence.resolved),
+            nearly_dependent=_nearly_dependent(fit, names),
+            prior="" if evidence.problem.prior is None else evidence.problem.prior.source,
+        ),
+        points=Points(
+            measured=int(data.seen.sum()),
+            used=int(use.sum()),
+            rejected=_rejected(evidence, predicted),
+            suspects=_suspects(evidence, predicted),
+            copies=copied_rows(data),
+        ),
+        residuals=Residuals(
+            vectors=residuals,
+            normalised=evidence.normalised,
+            gate=evidence.gate,
+            before=residual_statistics(distances(before[use])),
+            after=residual_statistics(distances(residuals[use])),
+            sigma=_scatter(evidence, residuals),
+            chi_square=ChiSquare(evidence.chi_square, evidence.freedom),
+        ),
+        noise=evidence.levels,
+        accuracy=_accuracy(evidence, evidence.problem.test_pose_array),
+        diagnostics=Diagnostics(
+            structure=evidence.structure,
+            disturbances=evidence.disturbances,
+            moved_since=evidence.moved_since,
+            hidden=evidence.hidden,
+            starts=evidence.starts,
+            agreeing_starts=evidence.agreeing,
+            seconds=evidence.seconds,
+        ),
     )
+    return judged(estimate)
 
 
 def fit_placement(robot: Robot, data: Measurements) -> Robot:
@@ -144,7 +145,7 @@ def fit_placement(robot: Robot, data: Measurements) -> Robot:
 
 def _placement(robot: Robot) -> list[str]:
     """Names of the unknown base's and targets' parameters."""
-    return [n for n in robot.parameter_names if n.startswith(("base.", "target_"))]
+    return [n for n in robot.parameter_names if is_nuisance(n)]
 
 
 def _placed(robot: Robot, data: Measurements, use: NDArray[np.bool_]) -> tuple[Motion, FloatArray]:
@@ -178,18 +179,22 @@ def _scatter(evidence: Evidence, residuals: FloatArray) -> float:
     return float(np.sqrt(np.sum(residuals[use] ** 2) / freedom)) if freedom > 0 else float("nan")
 
 
-def _accuracy(evidence: Evidence, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Per test pose: ρ0 of eq. (14), infinite if it rests on what the data cannot see, and discrepancy [m]."""
-    robot, fit = evidence.robot, evidence.fit
+def _accuracy(evidence: Evidence, poses: FloatArray) -> Accuracy:
+    """Eq. (14), discrepancy and joint corrections at the test poses (K, joints)."""
+    robot, fit, required = evidence.robot, evidence.fit, evidence.problem.required_accuracy
+    required = float("nan") if required is None else required
     if not len(poses):
-        return np.empty(0), np.empty(0)
+        return Accuracy(poses, np.empty(0), np.empty(0), None, required)
     targets = len(robot.targets)
     jacobians = robot.jacobian(poses, fit.deviations)
     per = np.sqrt(np.einsum("kia,ab,kib->k", jacobians, evidence.covariance, jacobians) / targets)
-    blind = _blind(evidence, poses)
-    per[blind] = np.inf
+    per[_blind(evidence, poses)] = np.inf
     spread = evidence.levels.discrepancy_covariance(robot, poses)
-    return per, np.sqrt(np.einsum("ktii->k", spread) / targets)
+    complete = None
+    if evidence.transmission is not None:
+        squares = np.einsum("ktii->kt", evidence.transmission.error_covariance(poses)).mean(axis=1)
+        complete = np.sqrt(squares)
+    return Accuracy(poses, per, np.sqrt(np.einsum("ktii->k", spread) / targets), complete, required)
 
 
 def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
@@ -220,7 +225,7 @@ def _nearly_dependent(fit: Fit, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _rejected(evidence: Evidence, predicted: FloatArray) -> tuple[dict[str, Any], ...]:
+def _rejected(evidence: Evidence, predicted: FloatArray) -> tuple[RejectedPoint, ...]:
     """A row per point not used: where, how far off, and why."""
     data, use = evidence.problem.data, evidence.equations.use
     out = data.seen & ~use
@@ -230,16 +235,16 @@ def _rejected(evidence: Evidence, predicted: FloatArray) -> tuple[dict[str, Any]
     return tuple(_point(evidence, predicted, i, t, words.get((i, t), "")) for i, t in np.argwhere(out).tolist())
 
 
-def _suspects(evidence: Evidence, predicted: FloatArray) -> tuple[dict[str, Any], ...]:
+def _suspects(evidence: Evidence, predicted: FloatArray) -> tuple[RejectedPoint, ...]:
     """Points that were used although they lie beyond the gate."""
     far = evidence.equations.use & (np.nan_to_num(evidence.normalised) > evidence.gate)
     return tuple(_point(evidence, predicted, i, t, "used nevertheless") for i, t in np.argwhere(far).tolist())
 
 
-def _point(evidence: Evidence, predicted: FloatArray, i: int, t: int, words: str) -> dict[str, Any]:
+def _point(evidence: Evidence, predicted: FloatArray, i: int, t: int, words: str) -> RejectedPoint:
     """Row (from 0), target (from 1), reason, residual in standard deviations and in metres."""
     ratio = float(evidence.normalised[i, t])
     error = float(np.linalg.norm(evidence.problem.data.p[i, t] - predicted[i, t]))
     reason = f"{ratio:.3g} standard deviations (gate {evidence.gate:.3g}), {length(error)} off"
     reason += f"; {words}" if words else ""
-    return {"row": i, "target": t + 1, "reason": reason, "normalised_residual": ratio, "residual": error}
+    return RejectedPoint(i, t + 1, reason, ratio, error)

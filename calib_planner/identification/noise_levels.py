@@ -75,6 +75,11 @@ class NoiseLevels:
     sliding: float = 0.0
     discrepancy: float = 0.0
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of one coordinate that the covariance rests on, discrepancy included [m]."""
+        return float(np.sqrt(self.measurement**2 + self.discrepancy**2))
+
     def discrepancy_covariance(self, robot: Robot, q: FloatArray) -> FloatArray:
         """D(q) of each target at configurations ``q``: (N, targets, 3, 3) [m²]."""
         sigma = np.where(robot.joint_is_revolute, self.turning, self.sliding)

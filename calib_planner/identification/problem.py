@@ -14,7 +14,7 @@ from scipy.linalg import solve_triangular
 from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.measurements import Measurements
-from calib_planner.robot import Robot
+from calib_planner.robot import Robot, is_nuisance
 from calib_planner.tracker import Noise
 
 LOSSES = ("linear", "robust")
@@ -201,7 +201,7 @@ def typical_prior(robot: Robot, length_std: float = LENGTH_STD, angle_std: float
     Joint zeros get ``OFFSET_STD``, next to nothing. ``None`` if there is no parameter left.
     """
     zeros = _joint_zeros(robot)
-    known = [p for p in robot.parameters if not p.name.startswith(("base.", "target_"))]
+    known = [p for p in robot.parameters if not is_nuisance(p.name)]
     if not known:
         return None
     usual = {"m": length_std, "rad": angle_std}

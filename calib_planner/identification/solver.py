@@ -48,7 +48,7 @@ from calib_planner.identification.robust import (
 from calib_planner.identification.transmission import Transmission, fit_transmission, geometry_covariance
 from calib_planner.identification.weighing import TINY, Weighed, Work, weigh, without_unseen
 from calib_planner.measurements import Measurements
-from calib_planner.robot import Robot
+from calib_planner.robot import BASE_PARAMETERS, Robot, target_parameters
 
 MOST_GATES = 12
 """Rounds of the gate; a selection that still changes then is taken as it is."""
@@ -114,9 +114,8 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
 
 def start_robot(robot: Robot, data: Measurements, *, robust: bool = False) -> Robot:
     """``robot`` with its unknown base and targets, if any, at their closed-form values for these data."""
-    active = robot.parameter_names
-    base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
-    tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
+    active = set(robot.parameter_names)
+    base, tool = active.issuperset(BASE_PARAMETERS), active.issuperset(target_parameters(len(robot.targets)))
     how = robust_registration if robust else register
     return how(robot, data, base=base, tool=tool)
 

@@ -38,8 +38,9 @@ from calib_planner.identification.registration import register
 from calib_planner.identification.robust import normalised
 from calib_planner.identification.solver import identify, start_robot
 from calib_planner.identification.transmission import Transmission
+from calib_planner.identification.verdict import judged
 from calib_planner.measurements import Measurements
-from calib_planner.robot import Robot
+from calib_planner.robot import Robot, target_parameters
 
 INSIDE = float(np.sqrt(chdtri(3, 0.05)))
 
@@ -79,7 +80,7 @@ def validate(
         expected = np.zeros((len(seat), 3)) if discrepancy is None else discrepancy.predict(seat.q)
         cleaned = Measurements(seat.joint_names, seat.q, seat.p - expected[:, None], seat.std)
         found.append([*(_predict(m, cleaned, rest) for m in models), _predict(before, seat, rest)])
-    return replace(estimate, validation=_statistics(found))
+    return judged(replace(estimate, validation=_statistics(found)))
 
 
 @one_thread
@@ -98,7 +99,7 @@ def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: in
     count = int(labels.max()) + 1
     check_count("folds", folds, low=2, high=count)
     fold = np.random.default_rng(seed).permutation(np.arange(count) % folds)[labels]
-    used = _without(problem.data, estimate)
+    used = problem.data.without(estimate.points.rejected)
     again = "off" if estimate.transmission is None else "auto"
     parts: list[list[_Prediction]] = []
     for k in range(folds):
@@ -108,7 +109,7 @@ def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: in
         rest = used.select(np.flatnonzero(fold == k))
         models = (*_models(found), _Geometry(_before(part), found))
         parts.append([_predict(m, rest.select(np.arange(0)), rest) for m in models])
-    return replace(estimate, cross_validation=replace(_statistics(parts), folds=folds))
+    return judged(replace(estimate, cross_validation=replace(_statistics(parts), folds=folds)))
 
 
 # ── predictions of one set ───────────────────────────────────────────────────────────────────────────
@@ -159,8 +160,8 @@ class _Geometry:
         return np.ascontiguousarray(self.robot.jacobian(q)).reshape(len(q), len(self.robot.targets), 3, -1)
 
     def covariance(self) -> FloatArray:
-        own = [self.estimate.parameters.index(n) for n in self.robot.parameter_names]
-        return self.estimate.covariance[np.ix_(own, own)]
+        own = [self.estimate.fit.parameters.index(n) for n in self.robot.parameter_names]
+        return self.estimate.fit.covariance[np.ix_(own, own)]
 
     def discrepancy(self, q: FloatArray) -> FloatArray:
         return self.estimate.noise.discrepancy_covariance(self.robot, q)
@@ -237,7 +238,7 @@ def _with_seat(
 ) -> tuple[FloatArray, FloatArray]:
     """J − J_t G J₀ and the covariance of e − J_t G e₀, target by target."""
     targets = len(model.robot.targets)
-    names = tuple(f"target_{t + 1}.{a}" for t in range(targets) for a in "xyz")
+    names = target_parameters(targets)
     moved = replace(model.robot, parameter_names=names)
     at_seat = moved.jacobian(model.actual(seat.q)).reshape(len(seat), targets, 3, -1)
     at_rest = moved.jacobian(model.actual(rest.q)).reshape(len(rest), targets, 3, -1)
@@ -307,20 +308,12 @@ def _before(problem: IdentificationProblem) -> Robot:
     return fit_placement(start_robot(problem.robot, problem.data, robust=robust), problem.data)
 
 
-def _without(data: Measurements, estimate: Estimate) -> Measurements:
-    """The data without the points that were rejected."""
-    points = np.array(data.p)
-    for point in estimate.rejected:
-        points[point["row"], point["target"] - 1] = np.nan
-    return Measurements(data.joint_names, data.q, points, data.std)
-
-
 def _discrepancy(problem: IdentificationProblem, estimate: Estimate) -> Discrepancy | None:
     """The systematic error over joint space, from the mean residual of each configuration's targets."""
-    data = _without(problem.data, estimate)
+    data = problem.data.without(estimate.points.rejected)
     rows = data.seen.any(axis=1)
     if rows.sum() < 2:
         return None
-    residuals = np.where(data.seen[:, :, None], estimate.residuals, 0.0)[rows]
+    residuals = np.where(data.seen[:, :, None], estimate.residuals.vectors, 0.0)[rows]
     mean = residuals.sum(axis=1) / data.seen[rows].sum(axis=1)[:, None]
     return fit_discrepancy(estimate.calibrated, data.q[rows], mean)

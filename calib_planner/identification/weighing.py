@@ -29,7 +29,7 @@ from calib_planner.identification.noise_levels import (
 )
 from calib_planner.identification.problem import UNKNOWN_SIGMA, IdentificationProblem
 from calib_planner.identification.robust import MEDIAN, spread
-from calib_planner.robot import Identifiability, Robot, analyse
+from calib_planner.robot import Identifiability, Robot, analyse, is_nuisance
 
 FIRST_ITERATIONS = 3
 """Iterations, at most, of the fit that tells how much the points scatter, roughly."""
@@ -97,7 +97,7 @@ class Work:
             lengths: (kept,) what each parameter kept adds to its predecessors there.
         """
         names = self.robot.parameter_names
-        placed = np.array([n.startswith(("base.", "target_")) for n in names])
+        placed = np.array([is_nuisance(n) for n in names])
         shortest = np.where(placed, 0.0, sigma / UNSEEN)
         if not (lengths < shortest[list(self.kept)]).any():
             return self
@@ -127,11 +127,11 @@ class Work:
 
     def start_values(self, start: Estimate | None) -> FloatArray:
         """(P,) deviations to begin from."""
-        if start is None or start.parameters != self.robot.parameter_names:
+        if start is None or start.fit.parameters != self.robot.parameter_names:
             return np.zeros(len(self.robot.parameter_names))
         nominal = np.array([p.nominal for p in self.robot.parameters])
         warm = np.zeros(len(nominal))
-        warm[list(self.kept)] = (start.values - nominal)[list(self.kept)]
+        warm[list(self.kept)] = (start.fit.values - nominal)[list(self.kept)]
         return warm
 
 

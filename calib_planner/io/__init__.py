@@ -10,7 +10,7 @@ from calib_planner.io.robots import URDF_SUFFIXES, Robot, config_folder, shipped
 
 if TYPE_CHECKING:
     from calib_planner.io.bag import BagTopics, is_bag, read_bag
-    from calib_planner.io.constraints import read_constraints
+    from calib_planner.io.conditions import read_constraints, read_instrument
     from calib_planner.io.csv import (
         angle_factors,
         format_table,
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         write_measurements,
     )
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
-    from calib_planner.io.instrument import read_instrument
     from calib_planner.io.journal import Journal, begin_journal, open_journal
     from calib_planner.io.kinematics import write_kinematics
     from calib_planner.io.plan import read_plan, write_plan
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
         open_store,
         stored_model,
     )
-    from calib_planner.io.text import read_text, write_text
+    from calib_planner.io.text import make_folder, read_text, write_text
     from calib_planner.io.urdf import (
         calibrated_urdf,
         parse_speed_limits,
@@ -56,11 +55,10 @@ __getattr__, __dir__, __all__ = lazy_door(
     __name__,
     {
         "bag": "BagTopics is_bag read_bag",
-        "constraints": "read_constraints",
+        "conditions": "read_constraints read_instrument",
         "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
         "read_plan_csv write_configurations write_measurements",
         "estimate": "calibrated_robot placement read_estimate write_estimate",
-        "instrument": "read_instrument",
         "journal": "Journal begin_journal open_journal",
         "kinematics": "write_kinematics",
         "plan": "read_plan write_plan",
@@ -68,7 +66,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "sheet": "WORDS write_sheet_csv write_sheet_yaml write_trajectory",
         "store": "ACCEPTED KEPT LONGEST OUTLIER UNDONE CampaignStore Decision StoredCampaign "
         "StoredModel UnavailableStore open_store stored_model",
-        "text": "read_text write_text",
+        "text": "make_folder read_text write_text",
         "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
         "write_calibrated_urdf",
     },

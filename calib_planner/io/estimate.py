@@ -1,39 +1,53 @@
 """Estimates as YAML: the keys are those of ``identify --json``, and what it takes to rebuild the robot.
 
-What is written comes back to the bit. A number that is unknown (NaN) is null; one that is infinite is ``.inf``: a
-test pose whose accuracy rests on what the data cannot see. Writing what was read gives the same file.
+What is written comes back to the bit, and writing what was read gives the same file. A number that is unknown
+(NaN) is null; one that is infinite is ``.inf``: a test pose whose accuracy rests on parameters that the data do
+not determine.
 
-    base: {x, y, z, yaw, pitch, roll, rx, ry, rz}    # the robot in the tracker's frame, see saved_estimate
-    targets: [[x, y, z], …]                          # in the tip's frame
+The nominal values of base and targets are the closed form's, not the robot's: they are places, not errors. So a
+file holds both as they were identified:
+
+    base: {x, y, z, yaw, pitch, roll, rx, ry, rz}    # the robot in the tracker's frame [m, rad]
+    targets: [[x, y, z], …]                          # in the tip's frame [m]
+
+A chain begins with the base's pose, T(x, y, z) Rz(yaw) Ry(pitch) Rx(roll) Rx(rx) Ry(ry) Rz(rz): roll, pitch and
+yaw are the closed form's orientation, and rx, ry and rz what was identified beyond it.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, frozen
-from calib_planner.errors import FileFormatError, InputError, UnknownNameError
+from calib_planner.arrays import FloatArray, plain
+from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import ChiSquare, Estimate, JointCorrections, NoiseLevels, Reason, Verdict
-from calib_planner.io.yaml import check_keys, read_document, read_value, write_document
-from calib_planner.robot import Element, Robot
+from calib_planner.io.yaml import Node, read_document, write_document
+from calib_planner.robot import Element, Robot, is_nuisance
 
 T = TypeVar("T")
+BASE = ("x", "y", "z", "yaw", "pitch", "roll", "rx", "ry", "rz")
+"""The numbers of a base pose, in the order of the chain's first elements."""
+SAME = 1e-9
+"""Nominal values may differ by this much between the estimate and the robot [m | rad]."""
+TARGET = re.compile(r"target_([1-9]\d{0,2})\.([xyz])")
 PARAMETER_KEYS = ("name", "unit", "nominal", "value", "deviation", "std")
 NEEDED = ("robot", "joint_names", "parameters", "covariance", "sigma", "status")
 SERIES = ("scale", "shift", "cosines", "sines")
 PER_POSE = "predicted_accuracy_per_test_pose"
-UNLIMITED = (
-    PER_POSE,
-    "predicted_accuracy",
-    "geometry_accuracy_per_test_pose",
-    "parameter_accuracy_per_test_pose",
-)
-"""What can be infinite; JSON has no word for it, YAML has."""
+UNLIMITED = {
+    PER_POSE: "predicted",
+    "predicted_accuracy": "overall",
+    "geometry_accuracy_per_test_pose": "geometry",
+    "parameter_accuracy_per_test_pose": "parameters",
+    "required_accuracy": "required",
+}
+"""Key → field of ``Accuracy`` that can be infinite; JSON has no word for that, YAML has."""
 
 
 def write_estimate(path: str | Path, estimate: Estimate | SavedEstimate, field: str = "output") -> None:
@@ -48,9 +62,9 @@ def write_estimate(path: str | Path, estimate: Estimate | SavedEstimate, field: 
 
 def document_of(estimate: Estimate) -> dict[str, Any]:
     """What ``write_estimate`` writes, without its format line, as plain values."""
-    result = estimate.to_dict()
-    result |= {name: _null(getattr(estimate, name)) for name in UNLIMITED if name in result}
-    return result | {"required_accuracy": _null(estimate.required_accuracy), **placement(estimate)}
+    content = estimate.to_dict()
+    unlimited = {key: getattr(estimate.accuracy, name) for key, name in UNLIMITED.items() if key in content}
+    return content | plain(unlimited, keep_infinite=True) | placement(estimate)
 
 
 def placement(estimate: Estimate) -> dict[str, Any]:
@@ -66,154 +80,98 @@ def read_estimate(path: str | Path) -> SavedEstimate:
     Raises:
         FileFormatError: Not an estimate of ours; names the key at fault and what is valid.
     """
-    return parse_estimate(path, read_document(path, "estimate"))
+    return parse_estimate(read_document(path, "estimate"))
 
 
-def parse_estimate(path: str | Path, document: dict[str, Any]) -> SavedEstimate:
-    """The estimate that a document holds; ``path`` is for errors, which are those of ``read_estimate``."""
-    check_keys(path, "document", document, NEEDED, tuple(document))
-    rows = document["parameters"]
-    if not isinstance(rows, list) or not rows:
-        raise FileFormatError(path, "parameters", repr(rows)[:60], "a list with a row per parameter")
-    for i, row in enumerate(rows):
-        check_keys(path, f"parameters[{i}]", row, PARAMETER_KEYS)
-    columns: dict[str, Any] = {k: [row[k] for row in rows] for k in PARAMETER_KEYS}
-    names = read_value(path, "parameters[].name", "tuple[str, ...]", columns["name"])
-    if len(set(names)) < len(names):
-        raise FileFormatError(path, "parameters[].name", "a name twice", "each name once")
-    columns |= {k: _finite(path, f"parameters[].{k}", columns[k], (len(rows),)) for k in PARAMETER_KEYS[2:5]}
-    per = document.get(PER_POSE) or []
+def parse_estimate(top: Node) -> SavedEstimate:
+    """The estimate that a document holds; errors are those of ``read_estimate``."""
+    top.mapping(None, NEEDED)
+    rows = [row.mapping(PARAMETER_KEYS, PARAMETER_KEYS) for row in top["parameters"].items()]
+    names, count = tuple(row["name"].of_kind("str") for row in rows), len(rows)
+    if len(set(names)) < count:
+        raise top["parameters"].error("a name twice", "each name once")
+
+    def column(key: str, *, finite: bool = True) -> FloatArray:
+        values = Node(top.path, f"parameters[].{key}", [row[key].value for row in rows])
+        return values.array((count,), finite=finite)
+
+    base, targets = top.get("base"), top.get("targets")
     return SavedEstimate(
-        robot=read_value(path, "robot", "str", document["robot"]),
-        joint_names=read_value(path, "joint_names", "tuple[str, ...]", document["joint_names"]),
+        robot=top["robot"].of_kind("str"),
+        joint_names=top["joint_names"].of_kind("tuple[str, ...]"),
         parameters=names,
-        units=read_value(path, "parameters[].unit", "tuple[str, ...]", columns["unit"]),
-        nominal=columns["nominal"],
-        values=columns["value"],
-        deviations=columns["deviation"],
-        std=_array(path, "parameters[].std", columns["std"], (len(rows),)),
-        covariance=_array(path, "covariance", document["covariance"], (len(rows), len(rows))),
-        sigma=read_value(path, "sigma", "float", _nan(document["sigma"])),
-        status=read_value(path, "status", "str", document["status"]),
-        base=_base(path, document.get("base")),
-        targets=_targets(path, document.get("targets")),
-        noise=_made(path, "noise", document.get("noise"), NoiseLevels),
-        chi_square=_made(path, "chi_square", document.get("chi_square"), ChiSquare, ("probability",)),
-        verdict=_verdict(path, document.get("verdict")),
-        predicted_accuracy_per_test_pose=_array(path, PER_POSE, per, (None,)),
-        joint_corrections=_corrections(path, document),
-        document=document,
+        units=tuple(row["unit"].of_kind("str") for row in rows),
+        nominal=column("nominal"),
+        values=column("value"),
+        deviations=column("deviation"),
+        std=column("std", finite=False),
+        covariance=top["covariance"].array((count, count), finite=False),
+        sigma=_float(top["sigma"]),
+        status=top["status"].of_kind("str"),
+        base=None if base.value is None else _in_order(base, BASE),
+        targets=None if targets.value is None else targets.array((None, 3)),
+        noise=_made(top.get("noise"), NoiseLevels),
+        chi_square=_made(top.get("chi_square"), ChiSquare, ("probability",)),
+        verdict=_verdict(top.get("verdict")),
+        predicted_accuracy_per_test_pose=Node(top.path, PER_POSE, top.get(PER_POSE).value or []).array(
+            (None,), finite=False
+        ),
+        joint_corrections=_corrections(top, names),
+        document=dict(top.value),
     )
 
 
-# ── parts of a document ──────────────────────────────────────────────────────────────────────────────
+def _in_order(node: Node, names: Sequence[str]) -> FloatArray:
+    """(names,) the numbers of a mapping with exactly these keys."""
+    node.mapping(names, names)
+    return Node(node.path, node.where, [node.value[name] for name in names]).array((len(names),))
 
 
-def _array(path: str | Path, key: str, value: Any, shape: tuple[int | None, ...]) -> FloatArray:
-    """Numbers, null being NaN, of a shape in which ``None`` is any length."""
-    array: FloatArray = read_value(path, key, "FloatArray", _nan(value))
-    if len(array.shape) != len(shape) or any(w not in (None, n) for w, n in zip(shape, array.shape, strict=True)):
-        wanted = " × ".join("any" if n is None else str(n) for n in shape)
-        raise FileFormatError(path, key, f"shape {array.shape}", f"numbers, {wanted}")
-    return frozen(array)
+def _float(node: Node) -> float:
+    """A number, null being NaN."""
+    return np.nan if node.value is None else float(node.of_kind("float"))
 
 
-def _base(path: str | Path, value: Any) -> FloatArray | None:
-    if value is None:
-        return None
-    base = check_keys(path, "base", value, BASE)
-    return _finite(path, "base", [base[name] for name in BASE], (len(BASE),))
-
-
-def _targets(path: str | Path, value: Any) -> FloatArray | None:
-    return None if value is None else _finite(path, "targets", value, (None, 3))
-
-
-def _finite(path: str | Path, key: str, value: Any, shape: tuple[int | None, ...]) -> FloatArray:
-    array = _array(path, key, value, shape)
-    if not np.isfinite(array).all():
-        raise FileFormatError(path, key, "a number that is not finite", "finite numbers")
-    return array
-
-
-def _made(path: str | Path, key: str, value: Any, kind: type[T], more: tuple[str, ...] = ()) -> T | None:
+def _made(node: Node, kind: type[T], more: tuple[str, ...] = ()) -> T | None:
     """A dataclass from the mapping of its fields; keys in ``more`` are derived from them.
 
     Fields with a default may be missing: an older version did not know them.
     """
-    if value is None:
+    if node.value is None:
         return None
     kinds = {f.name: str(f.type) for f in fields(kind)}  # type: ignore[arg-type]
     needed = [f.name for f in fields(kind) if f.default is MISSING]  # type: ignore[arg-type]
-    found = check_keys(path, key, value, needed, (*kinds, *more))
+    node.mapping((*kinds, *more), needed)
 
     def item(name: str) -> Any:
-        given = _nan(found[name]) if kinds[name] == "float" else found[name]
-        return read_value(path, f"{key}.{name}", kinds[name], given)
+        return _float(node[name]) if kinds[name] == "float" else node[name].of_kind(kinds[name])
 
-    return kind(**{name: item(name) for name in kinds if name in found})
+    return kind(**{name: item(name) for name in kinds if name in node})
 
 
-def _corrections(path: str | Path, document: dict[str, Any]) -> SavedCorrections | None:
-    given = document.get("joint_corrections")
-    if given is None:
+def _corrections(top: Node, names: tuple[str, ...]) -> SavedCorrections | None:
+    node = top.get("joint_corrections")
+    if node.value is None:
         return None
-    top = "joint_corrections"
-    found = check_keys(path, top, given, ("parameters", *SERIES), tuple(given))
-    names, count = [row["name"] for row in document["parameters"]], len(document["joint_names"])
-    values = check_keys(path, f"{top}.parameters", found["parameters"], names)
+    node.mapping(None, ("parameters", *SERIES))
+    joints = tuple(top["joint_names"].value)
+    count = len(joints)
     shapes = {"scale": (count,), "shift": (count,), "cosines": (count, None), "sines": (count, None)}
-    series = {name: _finite(path, f"{top}.{name}", found[name], shapes[name]) for name in SERIES}
+    series = {name: node[name].array(shapes[name]) for name in SERIES}
     if series["cosines"].shape != series["sines"].shape:
-        got = f"shape {series['sines'].shape}"
-        raise FileFormatError(path, f"{top}.sines", got, f"shape {series['cosines'].shape}, as cosines")
-    corrections = JointCorrections(tuple(document["joint_names"]), **series)
-    numbers = _finite(path, f"{top}.parameters", [values[n] for n in names], (len(names),))
-    return SavedCorrections(corrections, tuple(names), numbers)
+        expected = f"shape {series['cosines'].shape}, as cosines"
+        raise node["sines"].error(f"shape {series['sines'].shape}", expected)
+    return SavedCorrections(JointCorrections(joints, **series), names, _in_order(node["parameters"], names))
 
 
-def _verdict(path: str | Path, value: Any) -> Verdict | None:
-    if value is None:
+def _verdict(node: Node) -> Verdict | None:
+    if node.value is None:
         return None
-    found = check_keys(path, "verdict", value, ("level", "reasons"))
-    if not isinstance(found["reasons"], list):
-        raise FileFormatError(path, "verdict.reasons", repr(found["reasons"])[:60], "a list of reasons")
-    made = [_made(path, f"verdict.reasons[{i}]", r, Reason) for i, r in enumerate(found["reasons"])]
-    reasons = tuple(r for r in made if r is not None)
-    return Verdict(read_value(path, "verdict.level", "str", found["level"]), reasons)
-
-
-# ── unknown numbers ──────────────────────────────────────────────────────────────────────────────────
-
-
-def _nan(value: Any) -> Any:
-    """null as NaN, also in lists."""
-    if isinstance(value, list):
-        return [_nan(v) for v in value]
-    return np.nan if value is None else value
-
-
-def _null(value: Any) -> Any:
-    """Arrays to lists and NaN to null; infinities stay."""
-    if isinstance(value, np.ndarray):
-        return _null(value.tolist())
-    if isinstance(value, list):
-        return [_null(v) for v in value]
-    return None if np.isnan(value) else value
-
-
-# ── What an estimate file says, and the calibrated robot rebuilt from it ────────────────────────────────────
-# The nominal values of base and targets are the closed form's, not the robot's: they are places, not errors. So a
-# file holds both as they were found. A chain begins with the base's pose,
-#
-#     T(x, y, z) Rz(yaw) Ry(pitch) Rx(roll) Rx(rx) Ry(ry) Rz(rz),
-#
-# roll, pitch and yaw being the closed form's orientation, and rx, ry and rz what was identified beyond it.
-
-BASE = ("x", "y", "z", "yaw", "pitch", "roll", "rx", "ry", "rz")
-"""The numbers of a base pose, in the order of the chain's first elements."""
-SAME = 1e-9
-"""Nominal values may differ by this much between the estimate and the robot [m | rad]."""
+    node.mapping(("level", "reasons"), ("level", "reasons"))
+    if not isinstance(node["reasons"].value, list):
+        raise node["reasons"].refused("a list of reasons")
+    reasons = [_made(r, Reason) for r in (node["reasons"].items() if node["reasons"].value else [])]
+    return Verdict(node["level"].of_kind("str"), tuple(r for r in reasons if r is not None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,12 +304,7 @@ class SavedEstimate:
     @property
     def chain_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are neither the base's nor the targets'."""
-        return tuple(n for n in self.parameters if not n.startswith(("base.", "target_")))
-
-
-# ── A robot with a saved estimate applied: what every use of a calibration begins with ──────────────────────
-
-TARGET = re.compile(r"target_([1-9]\d{0,2})\.([xyz])")
+        return tuple(n for n in self.parameters if not is_nuisance(n))
 
 
 def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:

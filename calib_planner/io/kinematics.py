@@ -28,9 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.io.yaml import check_keys, read_mapping, read_value, write_document
+from calib_planner.io.yaml import Node, read_yaml, write_document
 from calib_planner.robot import JointOrigins, Origin, Robot, joint_origins, with_origins
 
 FORMAT = "calib_planner/kinematics"
@@ -81,19 +80,19 @@ def read_kinematics(path: str | Path, robot: Robot) -> Robot:
         FileFormatError: Not such a file, changed since it was written (the hash differs), or of a robot with
             other joints or axes.
     """
-    document = read_mapping(path, WHAT)
-    if document.get("format") != FORMAT:
+    document = read_yaml(path, WHAT)
+    if document.get("format").value != FORMAT:
         advice = "its hash could not be checked; give a file that identify --kinematics-output wrote"
-        raise FileFormatError(path, "format", repr(document.get("format"))[:60], FORMAT, advice)
-    origins = _read(path, document)
+        raise document.get("format").refused(FORMAT, advice)
+    origins = _read(document)
     here = joint_origins(robot)
     if tuple(origins.joints) != tuple(here.joints):
-        raise FileFormatError(path, "joints", ", ".join(origins.joints), f"{', '.join(here.joints)}: the robot's")
+        raise document["joints"].error(", ".join(origins.joints), f"{', '.join(here.joints)}: the robot's")
     for name, axis in here.axes.items():
         if np.abs(axis - origins.axes[name]).max() > 1e-9:
             raise FileFormatError(path, f"axes of {name}", origins.axes[name], f"{axis}: the robot's")
     if (origins.tip is None) != (here.tip is None):
-        raise FileFormatError(path, "tip", "the other kind of robot", "a robot read from the same kind of file")
+        raise document.get("tip").error("the other kind of robot", "a robot read from the same kind of file")
     return with_origins(robot, origins.joints, origins.tip)
 
 
@@ -111,20 +110,20 @@ def entry_names(joints: Sequence[str]) -> dict[str, str]:
     return {name: name for name in joints}
 
 
-def _read(path: str | Path, document: Mapping[str, Any]) -> JointOrigins:
-    check_keys(path, "document", document, ("format", "robot", "joints", "axes", "kinematics"), ("tip",))
-    joints = document["joints"]
-    if not isinstance(joints, Mapping) or not all(isinstance(v, str) for v in joints.values()):
-        raise FileFormatError(path, "joints", repr(joints)[:60], "a mapping from entry to joint name")
-    axes = check_keys(path, "axes", document["axes"], tuple(joints))
-    entries = check_keys(path, "kinematics", document["kinematics"], (*joints, "hash"))
-    poses = {key: _pose(path, f"kinematics.{key}", entries[key]) for key in joints}
-    axis_of = {key: _numbers(path, f"axes.{key}", axes[key], 3) for key in joints}
-    tip = {"tip": _pose(path, "tip", document["tip"])} if "tip" in document else {}
+def _read(document: Node) -> JointOrigins:
+    required = ("format", "robot", "joints", "axes", "kinematics")
+    document.mapping((*required, "tip"), required)
+    joints = document["joints"].mapping().value
+    if not all(isinstance(name, str) for name in joints.values()):
+        raise document["joints"].refused("a mapping from entry to joint name")
+    axes = document["axes"].mapping(joints, joints)
+    entries = document["kinematics"].mapping((*joints, "hash"), (*joints, "hash"))
+    poses = {key: _pose(entries[key]) for key in joints}
+    axis_of = {key: axes[key].array((3,)) for key in joints}
+    tip = {"tip": _pose(document["tip"])} if "tip" in document else {}
     expected = _hash(poses, {k: v.tolist() for k, v in axis_of.items()}, tip)
-    if entries["hash"] != expected:
-        advice = "the numbers were changed since; write the file anew"
-        raise FileFormatError(path, "kinematics.hash", repr(entries["hash"])[:80], expected, advice)
+    if entries["hash"].value != expected:
+        raise entries["hash"].refused(expected, "the numbers were changed since; write the file anew")
     return JointOrigins(
         joints={joints[key]: _as_origin(pose) for key, pose in poses.items()},
         axes={joints[key]: axis for key, axis in axis_of.items()},
@@ -141,17 +140,9 @@ def _as_origin(pose: Mapping[str, float]) -> Origin:
     return Origin(values[:3], values[3:])
 
 
-def _pose(path: str | Path, where: str, item: Any) -> dict[str, float]:
-    entry = check_keys(path, where, item, POSE_KEYS)
-    values = _numbers(path, where, [entry[k] for k in POSE_KEYS], len(POSE_KEYS))
-    return dict(zip(POSE_KEYS, values.tolist(), strict=True))
-
-
-def _numbers(path: str | Path, where: str, item: Any, count: int) -> FloatArray:
-    values: FloatArray = read_value(path, where, "FloatArray", item)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise FileFormatError(path, where, repr(item)[:80], f"{count} finite numbers")
-    return values
+def _pose(entry: Node) -> dict[str, float]:
+    entry.mapping(POSE_KEYS, POSE_KEYS)
+    return {key: float(entry[key].array(())) for key in POSE_KEYS}
 
 
 def _hash(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calib_planner.errors import FileFormatError
-from calib_planner.io.yaml import check_keys, read_document, read_value, write_document
+from calib_planner.io.yaml import Node, read_document, write_document
 from calib_planner.planning import KEYS, KINDS, Plan
 
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -40,25 +38,25 @@ def read_plan(path: str | Path) -> Plan:
     Raises:
         FileFormatError: Not a plan of ours; names the key at fault, what it holds and what is valid.
     """
-    return parse_plan(path, read_document(path, "plan"))
+    return parse_plan(read_document(path, "plan"))
 
 
-def parse_plan(path: str | Path, document: Any, finite: Sequence[str] = FINITE) -> Plan:
-    """The plan in a mapping of its fields, of which the arrays in ``finite`` have to be.
+def parse_plan(document: Node, finite: Sequence[str] = FINITE) -> Plan:
+    """The plan in a mapping of its values, of which the arrays in ``finite`` have to be.
 
     Raises:
-        FileFormatError: As ``read_plan``; ``path`` is for the error.
+        FileFormatError: As ``read_plan``.
     """
-    document = check_keys(path, "document", document, KEYS)
-    values = {n: read_value(path, n, KINDS[n], document[n]) for n in KEYS}
+    document.mapping(KEYS, KEYS, "was it written by another version?")
+    values = {name: document[name].of_kind(KINDS[name]) for name in KEYS}
     for name, axes in SHAPES.items():
         wanted = tuple(len(values[a]) for a in axes)
         if values[name].shape != wanted:
             expected = f"an array of shape {wanted} (as {', '.join(axes)})"
-            raise FileFormatError(path, name, f"shape {values[name].shape}", expected)
+            raise document[name].error(f"shape {values[name].shape}", expected)
     for name in finite:
         if not np.isfinite(values[name]).all():
-            raise FileFormatError(path, name, "a number that is not finite", "finite numbers only")
+            raise document[name].error("a number that is not finite", "finite numbers only")
     if not (values["repetitions"] >= 1).all():
-        raise FileFormatError(path, "repetitions", "a number below 1", "whole numbers >= 1")
+        raise document["repetitions"].error("a number below 1", "whole numbers >= 1")
     return Plan.from_values(values)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
 from calib_planner.io.urdf import read_urdf
-from calib_planner.io.yaml import YamlReader, brief
+from calib_planner.io.yaml import Node, read_yaml
 from calib_planner.robot import (
     KINDS,
     ROW_TYPES,
@@ -115,142 +113,124 @@ def read_robot_yaml(path: Path) -> Robot:
     Raises:
         FileFormatError: Names the key at fault, what it holds and what is valid.
     """
-    reader = _Reader(path)
-    document = reader.document()
+    top = read_yaml(path, "readable YAML of a robot").mapping(KEYS, ("joints",))
     try:
-        return reader.robot(document)
+        return _robot(top)
     except FileFormatError:
         raise
     except CalibPlannerError as error:
-        raise reader.error("robot", error, "a consistent chain") from None
+        raise FileFormatError(path, "robot", error, "a consistent chain") from None
 
 
-class _Reader(YamlReader):
-    """Reads one document."""
+def _robot(top: Node) -> Robot:
+    joints = [joint.mapping(JOINT_KEYS, ("name", "lower", "upper")) for joint in top["joints"].items()]
+    names = tuple(joint["name"].name() for joint in joints)
+    check_joint_names(top.path, names)
+    chain, levels = _chain(top, names)
+    chain = [*_base(top.get("base", {})), *_with_placement_errors(chain, names)]
+    full = tuple(f"{names[e.joint]}.{x}" for e in chain if e.joint is not None for x in PLACEMENT_ERRORS)
+    levels = _levels(top, {**levels, "full": full}, [e.parameter for e in chain if e.parameter])
+    robot = Robot(
+        name=top.get("name", Path(top.path).stem).name(),
+        elements=tuple(chain),
+        targets=target_elements(np.array([t.numbers(3) for t in top.get("targets", [[0, 0, 0]]).items()])),
+        joint_names=names,
+        joint_limits=np.array([_limits(joint) for joint in joints]),
+        levels=levels,
+        parameter_names=levels.get("lengths+offsets") or full,
+        source=str(top.path),
+    )
+    for joint, turns in zip(joints, robot.joint_is_revolute, strict=True):
+        valid = ANGLES if turns else LENGTHS
+        if joint.get("unit", next(iter(valid))).value not in valid:
+            kind = "turns" if turns else "slides"
+            raise joint["unit"].refused(f"one of: {', '.join(valid)}, as the joint {kind}")
+    return robot
 
-    def robot(self, document: Any) -> Robot:
-        top = self.mapping("document", document, KEYS, required=("joints",))
-        joints = [
-            self.mapping(f"joints[{i}]", j, JOINT_KEYS, required=("name", "lower", "upper"))
-            for i, j in enumerate(self.sequence("joints", top["joints"]))
-        ]
-        names = tuple(self.text(f"joints[{i}].name", j["name"]) for i, j in enumerate(joints))
-        check_joint_names(self.path, names)
-        chain, levels = self.chain(top, names)
-        chain = [*self.base(top.get("base", {})), *_with_placement_errors(chain, names)]
-        full = tuple(f"{names[e.joint]}.{x}" for e in chain if e.joint is not None for x in PLACEMENT_ERRORS)
-        levels = self.levels(top, {**levels, "full": full}, [e.parameter for e in chain if e.parameter])
-        robot = Robot(
-            name=self.text("name", top.get("name", self.path.stem)),
-            elements=tuple(chain),
-            targets=target_elements(self.targets(top.get("targets", [[0, 0, 0]]))),
-            joint_names=names,
-            joint_limits=np.array([self.limits(f"joints[{i}]", j) for i, j in enumerate(joints)]),
-            levels=levels,
-            parameter_names=levels.get("lengths+offsets") or full,
-            source=str(self.path),
-        )
-        self.check_units(robot, joints)
-        return robot
 
-    def chain(self, top: Mapping[str, Any], names: Sequence[str]) -> tuple[list[Element], Levels]:
-        """The chain and the levels that it brings."""
-        given = [key for key in CHAINS if key in top]
-        if len(given) != 1:
-            raise self.error(
-                "document", " and ".join(given) or "no chain", f"exactly one of: {', '.join(CHAINS)}"
-            )
-        if given != ["elements"]:
-            return self.table(given[0], top[given[0]], names)
-        items = enumerate(self.sequence("elements", top["elements"]))
-        return [self.element(f"elements[{i}]", item, names) for i, item in items], {}
+def _chain(top: Node, names: Sequence[str]) -> tuple[list[Element], Levels]:
+    """The chain and the levels that it brings."""
+    given = [key for key in CHAINS if key in top]
+    if len(given) != 1:
+        raise top.error(" and ".join(given) or "no chain", f"exactly one of: {', '.join(CHAINS)}")
+    if given != ["elements"]:
+        return _table(top[given[0]], names, modified=given == ["modified_dh"])
+    return [_element(entry, names) for entry in top["elements"].items()], {}
 
-    def element(self, where: str, item: Any, joint_names: Sequence[str]) -> Element:
-        entry = self.mapping(where, item, ELEMENT_KEYS, required=("type",))
-        names = {
-            key: None if entry.get(key) is None else self.text(f"{where}.{key}", entry[key])
-            for key in ("joint", "parameter")
-        }
-        joint = names["joint"]
-        return Element(
-            kind=self.choice(f"{where}.type", entry["type"], KINDS),
-            value=self.number(f"{where}.value", entry.get("value", 0.0)),
-            joint=None if joint is None else joint_names.index(self.choice(f"{where}.joint", joint, joint_names)),
-            sign=self.sign(f"{where}.sign", entry.get("sign", 1)),
-            parameter=names["parameter"],
-        )
 
-    def table(self, key: str, item: Any, names: Sequence[str]) -> tuple[list[Element], Levels]:
-        """A Denavit–Hartenberg table."""
-        table = self.mapping(key, item, TABLE_KEYS, required=("rows",))
-        length = LENGTHS[self.choice(f"{key}.length_unit", table.get("length_unit", "m"), LENGTHS)]
-        angle = ANGLES[self.choice(f"{key}.angle_unit", table.get("angle_unit", "rad"), ANGLES)]
-        scales = {"theta": angle, "d": length, "a": length, "alpha": angle}
-        items = enumerate(self.sequence(f"{key}.rows", table["rows"]))
-        rows = [self.row(f"{key}.rows[{i}]", entry, names, scales) for i, entry in items]
-        check_joint_names(self.path, [row.joint for row in rows])
-        for name in set(names).difference(row.joint for row in rows):
-            raise self.error(f"{key}.rows", f"no row of joint {name!r}", "one row for every joint")
-        modified = key == "modified_dh"
-        return list(dh_elements(rows, names, modified=modified)), dh_levels(rows, modified=modified)
+def _element(entry: Node, joint_names: Sequence[str]) -> Element:
+    entry.mapping(ELEMENT_KEYS, ("type",))
+    joint, parameter = (
+        None if entry.get(key).value is None else entry[key].name() for key in ("joint", "parameter")
+    )
+    return Element(
+        kind=entry["type"].choice(KINDS),
+        value=entry.get("value", 0.0).number(),
+        joint=None if joint is None else joint_names.index(_joint_name(entry["joint"], joint_names)),
+        sign=_sign(entry.get("sign", 1)),
+        parameter=parameter,
+    )
 
-    def row(self, where: str, item: Any, names: Sequence[str], scales: Mapping[str, float]) -> DhRow:
-        entry = self.mapping(where, item, ROW_KEYS, required=("joint",))
-        joint = self.text(f"{where}.joint", entry["joint"])
-        kind = self.choice(f"{where}.type", entry.get("type", "revolute"), ROW_TYPES)
-        if kind == "fixed" and (joint in names or "sign" in entry):
-            raise self.error(where, f"a sign or the joint {joint!r}", "neither, in a row whose type is fixed")
-        if kind != "fixed":
-            self.choice(f"{where}.joint", joint, names)
-        numbers = {k: s * self.number(f"{where}.{k}", entry[k]) for k, s in scales.items() if k in entry}
-        return DhRow(joint, kind, sign=self.sign(f"{where}.sign", entry.get("sign", 1)), **numbers)
 
-    def sign(self, where: str, item: Any) -> float:
-        sign = self.number(where, item)
-        if abs(sign) != 1.0:
-            raise self.error(where, brief(item), "+1 or -1")
-        return sign
+def _joint_name(node: Node, joint_names: Sequence[str]) -> str:
+    return Node(node.path, node.where, node.name()).choice(joint_names)
 
-    def levels(self, top: Mapping[str, Any], own: Levels, known: Sequence[str]) -> Levels:
-        """All levels that are not empty; ``own`` are the chain's."""
-        found = {
-            key: self.names(key, top[key], known) if key in top else own.get(key, ())
-            for key in ("offsets", "lengths")
-        }
-        found["lengths+offsets"] = (*found["lengths"], *found["offsets"])
-        found |= {key: names for key, names in own.items() if key not in found}
-        further = top.get("levels", {})
-        for key in self.mapping("levels", further, tuple(further) if isinstance(further, Mapping) else ()):
-            name = self.text("levels", key)
-            if name in found or name in known or "," in name:
-                raise self.error(
-                    "levels", repr(name), "a name that no other level or parameter has, without commas"
-                )
-            found[name] = self.names(f"levels.{name}", further[key], known)
-        return {key: tuple(names) for key, names in found.items() if names}
 
-    def base(self, item: Any) -> tuple[Element, ...]:
-        base = self.mapping("base", item, ("xyz", "rpy"))
-        xyz, rpy = (self.vector(f"base.{k}", base.get(k, [0, 0, 0])) for k in ("xyz", "rpy"))
-        return pose_elements("base", xyz, rpy)
+def _table(table: Node, names: Sequence[str], *, modified: bool) -> tuple[list[Element], Levels]:
+    """A Denavit–Hartenberg table."""
+    table.mapping(TABLE_KEYS, ("rows",))
+    length = LENGTHS[table.get("length_unit", "m").choice(LENGTHS)]
+    angle = ANGLES[table.get("angle_unit", "rad").choice(ANGLES)]
+    scales = {"theta": angle, "d": length, "a": length, "alpha": angle}
+    rows = [_row(entry, names, scales) for entry in table["rows"].items()]
+    check_joint_names(table.path, [row.joint for row in rows])
+    for name in set(names).difference(row.joint for row in rows):
+        raise table["rows"].error(f"no row of joint {name!r}", "one row for every joint")
+    return list(dh_elements(rows, names, modified=modified)), dh_levels(rows, modified=modified)
 
-    def targets(self, item: Any) -> FloatArray:
-        return np.array([self.vector(f"targets[{i}]", t) for i, t in enumerate(self.sequence("targets", item))])
 
-    def limits(self, where: str, joint: Mapping[str, Any]) -> tuple[float, float]:
-        scales = ANGLES | LENGTHS
-        scale = scales[self.choice(f"{where}.unit", joint.get("unit", "rad"), scales)]
-        lower, upper = (scale * self.number(f"{where}.{key}", joint[key]) for key in ("lower", "upper"))
-        return lower, upper
+def _row(entry: Node, names: Sequence[str], scales: Mapping[str, float]) -> DhRow:
+    entry.mapping(ROW_KEYS, ("joint",))
+    joint = entry["joint"].name()
+    kind = entry.get("type", "revolute").choice(ROW_TYPES)
+    if kind == "fixed" and (joint in names or "sign" in entry):
+        raise entry.error(f"a sign or the joint {joint!r}", "neither, in a row whose type is fixed")
+    if kind != "fixed":
+        _joint_name(entry["joint"], names)
+    numbers = {key: scale * entry[key].number() for key, scale in scales.items() if key in entry}
+    return DhRow(joint, kind, sign=_sign(entry.get("sign", 1)), **numbers)
 
-    def check_units(self, robot: Robot, joints: Sequence[Mapping[str, Any]]) -> None:
-        """A unit that is given must be one of the joint's kind."""
-        for i, (joint, turns) in enumerate(zip(joints, robot.joint_is_revolute, strict=True)):
-            valid = ANGLES if turns else LENGTHS
-            if joint.get("unit", next(iter(valid))) not in valid:
-                kind = "turns" if turns else "slides"
-                expected = f"one of: {', '.join(valid)}, as the joint {kind}"
-                raise self.error(f"joints[{i}].unit", repr(joint["unit"]), expected)
+
+def _sign(node: Node) -> float:
+    sign = node.number()
+    if abs(sign) != 1.0:
+        raise node.refused("+1 or -1")
+    return sign
+
+
+def _levels(top: Node, own: Levels, known: Sequence[str]) -> Levels:
+    """All levels that are not empty; ``own`` are the chain's."""
+    levels = {key: top[key].names(known) if key in top else own.get(key, ()) for key in ("offsets", "lengths")}
+    levels["lengths+offsets"] = (*levels["lengths"], *levels["offsets"])
+    levels |= {key: names for key, names in own.items() if key not in levels}
+    for name, node in top.get("levels", {}).mapping().entries():
+        if name in levels or name in known or "," in name:
+            expected = "a name that no other level or parameter has, without commas"
+            raise top["levels"].error(repr(name), expected)
+        levels[name] = node.names(known)
+    return {key: tuple(names) for key, names in levels.items() if names}
+
+
+def _base(node: Node) -> tuple[Element, ...]:
+    node.mapping(("xyz", "rpy"))
+    xyz, rpy = (node.get(key, [0, 0, 0]).numbers(3) for key in ("xyz", "rpy"))
+    return pose_elements("base", xyz, rpy)
+
+
+def _limits(joint: Node) -> tuple[float, float]:
+    scales = ANGLES | LENGTHS
+    scale = scales[joint.get("unit", "rad").choice(scales)]
+    return scale * joint["lower"].number(), scale * joint["upper"].number()
 
 
 def _with_placement_errors(chain: Sequence[Element], joint_names: Sequence[str]) -> list[Element]:

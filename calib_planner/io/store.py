@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 
 from calib_planner.acquisition import Reason, Rejection, Standstill
-from calib_planner.arrays import FloatArray, frozen
+from calib_planner.arrays import FloatArray, frozen, plain
 from calib_planner.errors import FileFormatError, InputError, StoreError
 from calib_planner.io.plan import parse_plan
-from calib_planner.io.yaml import read_value
+from calib_planner.io.yaml import Node
 from calib_planner.planning import Plan
 
 LATEST = """
@@ -500,7 +500,7 @@ def plan_text(plan: Plan | None) -> str | None:
     """A plan as JSON of its fields, exact to the bit; ``None`` for none."""
     if plan is None:
         return None
-    return json.dumps({k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in plan.values().items()})
+    return json.dumps(plain(plan.values(), keep_infinite=True, keep_nan=True))
 
 
 def plan_of(path: str | Path, text: str | None) -> Plan | None:
@@ -515,7 +515,7 @@ def plan_of(path: str | Path, text: str | None) -> Plan | None:
         document = json.loads(text)
     except (TypeError, ValueError) as error:
         raise FileFormatError(path, "plan", error, "a plan as JSON") from None
-    return parse_plan(path, document, WIRE)
+    return parse_plan(Node(path, "plan", document), WIRE)
 
 
 def same_plan(one: Plan | None, other: Plan | None) -> bool:
@@ -531,21 +531,11 @@ def same_plan(one: Plan | None, other: Plan | None) -> bool:
 
 def _text(values: FloatArray) -> str:
     """Numbers as JSON, NaN as null."""
-    return json.dumps(_null(values.tolist()))
-
-
-def _null(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_null(v) for v in value]
-    return None if np.isnan(value) else value
+    return json.dumps(plain(values))
 
 
 def _array(path: str | Path, where: str, text: str, shape: tuple[int, ...]) -> FloatArray:
-    values = np.asarray(json.loads(text), dtype=float)  # None becomes NaN
-    array: FloatArray = read_value(path, where, "FloatArray", values)
-    if array.shape != shape:
-        raise FileFormatError(path, where, f"shape {array.shape}", f"shape {shape}, as the robot and its targets")
-    return frozen(array)
+    return Node(path, where, json.loads(text)).array(shape, finite=False)
 
 
 # ── The file of a campaign store: made, opened for one process alone, checked, and brought up to date ───────

@@ -12,6 +12,26 @@ MAX_BYTES = 50_000_000
 """Larger files are refused: a plan or a day's measurements is far below a megabyte."""
 
 
+def user_path(path: str | Path) -> Path:
+    """The path that a user gave, with ``~`` as the home folder."""
+    return Path(path).expanduser()
+
+
+def make_folder(folder: str | Path, field: str = "output") -> Path:
+    """The folder, made with those above it if it is not there.
+
+    Raises:
+        InputError: It cannot be made; names ``field``.
+    """
+    target = user_path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = f"{folder} ({error.strerror})"
+        raise InputError(field, reason, "a folder that can be made", "choose another") from None
+    return target
+
+
 def read_text(path: str | Path, what: str) -> str:
     """The text of a UTF-8 file, without a byte order mark.
 
@@ -32,7 +52,7 @@ def read_bytes(path: str | Path, what: str) -> bytes:
         FileFormatError: No such file, not readable or too big.
     """
     try:
-        with open(Path(path).expanduser(), "rb") as file:
+        with open(user_path(path), "rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
         reason = error.strerror or error
@@ -68,7 +88,7 @@ def write_text(path: str | Path, text: str, field: str = "output") -> None:
     Raises:
         InputError: The path cannot be written.
     """
-    target = Path(path).expanduser()
+    target = user_path(path)
     try:
         if target.exists() and not target.is_file() and not target.is_dir():
             target.write_text(text, encoding="utf-8")

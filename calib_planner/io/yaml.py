@@ -1,27 +1,242 @@
-"""YAML documents of this package: a format name, then plain values. No objects, no aliases are read."""
+"""The one reader and the one writer of this package's YAML files.
+
+A file holds mappings, lists and plain values. A ``Node`` is one of them that knows its file and the keys that
+lead to it, so that every error names the file, the key, what stands there and what is valid. Reading a file means
+going from node to node: ``top["tracker"]["range"].numbers(2)``.
+
+No objects are read, and no aliases: a few lines of those can stand for gigabytes. Numbers are written as in
+YAML 1.2, so that ``3e-5`` is a number; PyYAML alone would take it for text. A number in quotes is text.
+"""
 
 from __future__ import annotations
 
-import reprlib
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, IntArray, frozen, plain
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io.text import read_text, write_text
+from calib_planner.units import brief
 
 UNICODE_BREAKS = ("\x85", "\u2028", "\u2029")
 """Line breaks beyond ASCII's, which YAML reads as white space inside a text."""
+T = TypeVar("T")
+
+
+def write_document(path: str | Path, kind: str, content: Mapping[str, Any], field: str = "output") -> None:
+    """Write ``content`` below a line that says what it is; floats are exact to the bit."""
+    document = {"format": f"calib_planner/{kind}", **plain(dict(content), keep_infinite=True, keep_nan=True)}
+    text = yaml.dump(document, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    if any(mark in text for mark in UNICODE_BREAKS):
+        text = yaml.dump(
+            document, Dumper=_Dumper, sort_keys=False, width=100
+        )  # escaped: YAML folds these into spaces
+    write_text(path, text, field)
+
+
+def read_yaml(path: str | Path, what: str) -> Node:
+    """The mapping that a YAML file holds; ``what`` says in errors what the file should be.
+
+    Raises:
+        FileFormatError: Not a text file, not YAML, or something else than a mapping.
+    """
+    text = read_text(path, what)
+    try:
+        document = yaml.load(text, Loader=_Loader)  # a SafeLoader
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise FileFormatError(path, "YAML", " ".join(str(error).split()), what) from None
+    if not isinstance(document, dict):
+        raise FileFormatError(path, "document", type(document).__name__, what)
+    return Node(path, "", document)
+
+
+def read_document(path: str | Path, kind: str) -> Node:
+    """The mapping of a file that ``write_document`` wrote, without its format line.
+
+    Raises:
+        FileFormatError: Not YAML, or not such a document.
+    """
+    top = read_yaml(path, f"a YAML file of calib_planner/{kind}")
+    if top.value.get("format") != f"calib_planner/{kind}":
+        advice = f"give a file that calib-planner {kind.replace('estimate', 'identify')} --output wrote"
+        raise top.get("format").refused(f"calib_planner/{kind}", advice)
+    return Node(path, "", {str(k): v for k, v in top.value.items() if k != "format"})
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value in a file.
+
+    Attributes:
+        path: The file, for errors.
+        where: The keys that lead here, such as ``dh.rows[0].a``; empty for the whole document.
+        value: The mapping, list or plain value.
+    """
+
+    path: str | Path
+    where: str
+    value: Any
+
+    # ── errors ───────────────────────────────────────────────────────────────────────────────────────
+
+    def error(self, got: object, expected: str, advice: str = "") -> FileFormatError:
+        """The error about this value, to be raised."""
+        return FileFormatError(self.path, self.where or "document", got, expected, advice)
+
+    def refused(self, expected: str, advice: str = "") -> FileFormatError:
+        """The error that shows the value itself, to be raised."""
+        return self.error(brief(self.value), expected, advice)
+
+    def build(self, make: Callable[[], T]) -> T:
+        """What ``make`` returns; its errors about a value become errors about this part of the file."""
+        try:
+            return make()
+        except FileFormatError:
+            raise
+        except InputError as error:
+            raise self._below(error.field).error(error.got, error.expected, error.advice) from None
+
+    # ── mappings and lists ───────────────────────────────────────────────────────────────────────────
+
+    def mapping(
+        self, keys: Collection[str] | None = None, required: Collection[str] = (), advice: str = ""
+    ) -> Node:
+        """Itself, once it is known to be a mapping with all required keys and, unless ``None``, only ``keys``."""
+        names = ", ".join(required if keys is None else keys)
+        if not isinstance(self.value, Mapping):
+            expected = f"a mapping with keys {names}" if names else "a mapping of keys to values"
+            raise self.error(f"{type(self.value).__name__} {brief(self.value)}", expected)
+        for key in self.value:
+            if keys is not None and key not in keys:
+                raise self.get(key).error(f"the unknown key {brief(key)}", f"only: {names}", advice)
+        for key in required:
+            if key not in self.value:
+                raise self.get(key).error(f"no key {key!r}", f"this key, of: {names}", advice)
+        return self
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.value
+
+    def __getitem__(self, key: str) -> Node:
+        """The value below a key that is there."""
+        return Node(self.path, self._below(key).where, self.value[key])
+
+    def get(self, key: str, default: Any = None) -> Node:
+        """The value below a key; ``default`` where the key is not there."""
+        return Node(self.path, self._below(key).where, self.value.get(key, default))
+
+    def entries(self) -> Iterator[tuple[str, Node]]:
+        """Keys and values of a mapping."""
+        return ((str(key), Node(self.path, self._below(key).where, v)) for key, v in self.value.items())
+
+    def items(self) -> list[Node]:
+        """The entries of a list that has at least one."""
+        if not isinstance(self.value, list) or not self.value:
+            raise self.refused("a list with at least one entry")
+        return [Node(self.path, f"{self.where}[{i}]", item) for i, item in enumerate(self.value)]
+
+    def _below(self, key: object) -> Node:
+        text = str(key)[:100]
+        return Node(self.path, f"{self.where}.{text}" if self.where else text, None)
+
+    # ── plain values ─────────────────────────────────────────────────────────────────────────────────
+
+    def number(self) -> float:
+        """A finite number."""
+        value = self.value
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+            advice = "a number in quotes is text: leave the quotes out" if _says_a_number(value) else ""
+            raise self.refused("a finite number", advice)
+        return float(value)
+
+    def numbers(self, length: int | None = None) -> FloatArray:
+        """(length,) a list of finite numbers; at least one if ``length`` is ``None``."""
+        value = self.value
+        if not isinstance(value, list) or not value or (length is not None and len(value) != length):
+            raise self.refused(f"a list of {length or 'one or more'} numbers")
+        return np.array([item.number() for item in self.items()])
+
+    def directions(self) -> FloatArray:
+        """(K, 3) one direction, or a list of them."""
+        several = isinstance(self.value, list) and self.value and isinstance(self.value[0], list)
+        return np.array([item.numbers(3) for item in (self.items() if several else [self])])
+
+    def angles(self, key: str, length: int) -> FloatArray:
+        """(length,) angles [rad], from ``key`` [rad] or ``key_deg`` [degrees]; a single one may be bare."""
+        degrees = f"{key}_deg"
+        if (key in self) == (degrees in self):
+            got = "both" if key in self else "neither"
+            raise self._below(key).error(got, f"either {key} [rad] or {degrees} [degrees]")
+        given = self[key if key in self else degrees]
+        bare = length == 1 and not isinstance(given.value, list)
+        angles = np.array([given.number()]) if bare else given.numbers(length)
+        return angles if key in self else np.radians(angles)
+
+    def truth(self) -> bool:
+        """True or false."""
+        if not isinstance(self.value, bool):
+            raise self.refused("true or false")
+        return self.value
+
+    def text(self) -> str:
+        """Text that is not empty."""
+        if not isinstance(self.value, str) or not self.value:
+            raise self.refused("text")
+        return self.value
+
+    def name(self) -> str:
+        """A name; a whole number is taken as it is written."""
+        if isinstance(self.value, bool) or not isinstance(self.value, (str, int)):
+            raise self.refused("a name")
+        return str(self.value)
+
+    def choice(self, valid: Collection[str]) -> str:
+        """One of a few texts."""
+        if not isinstance(self.value, str) or self.value not in valid:
+            raise self.refused(f"one of: {', '.join(valid)}")
+        return self.value
+
+    def names(self, known: Collection[str]) -> tuple[str, ...]:
+        """A list of different names, all of them known."""
+        if not isinstance(self.value, list):
+            raise self.refused("a list of parameter names")
+        for name in self.value:
+            if not isinstance(name, str) or name not in known:
+                raise self.error(brief(name), f"only: {', '.join(sorted(known))}")
+            if self.value.count(name) > 1:
+                raise self.error(f"{name!r} twice", "each name once")
+        return tuple(self.value)
+
+    # ── what ``write_document`` wrote ────────────────────────────────────────────────────────────────
+
+    def array(self, shape: Sequence[int | None], *, finite: bool = True) -> FloatArray:
+        """Numbers of a shape in which ``None`` is any length; null is NaN, if they need not be finite."""
+        array: FloatArray = Node(self.path, self.where, _null_as_nan(self.value)).of_kind("FloatArray")
+        fits = array.ndim == len(shape) and all(w in (None, n) for w, n in zip(shape, array.shape, strict=True))
+        if not fits:
+            wanted = " × ".join("any" if n is None else str(n) for n in shape)
+            raise self.error(f"shape {array.shape}", f"numbers, {wanted}")
+        if finite and not np.isfinite(array).all():
+            raise self.error("a number that is not finite", "finite numbers only")
+        return frozen(array)
+
+    def of_kind(self, kind: str) -> Any:
+        """The value of a dataclass field that is annotated with ``kind``, a key of ``KINDS``."""
+        read, expected = KINDS[kind]
+        try:
+            return read(self.value)
+        except (TypeError, ValueError, OverflowError):
+            raise self.refused(expected) from None
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader, without aliases: a few lines of them can stand for gigabytes."""
+    """The safe loader without aliases, with the numbers of YAML 1.2."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -29,96 +244,40 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def write_document(path: str | Path, kind: str, content: Mapping[str, Any], field: str = "output") -> None:
-    """Write ``content`` below a line that says what it is; floats are exact to the bit."""
-    plain = {"format": f"calib_planner/{kind}", **{k: _plain(v) for k, v in content.items()}}
-    text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=100)
-    if any(mark in text for mark in UNICODE_BREAKS):
-        text = yaml.safe_dump(plain, sort_keys=False, width=100)  # escaped: YAML folds these into spaces
-    write_text(path, text, field)
+class _Dumper(yaml.SafeDumper):
+    """The safe dumper that puts texts into quotes which ``_Loader`` would take for numbers."""
 
 
-def read_mapping(path: str | Path, what: str) -> dict[str, Any]:
-    """The mapping that a YAML file holds, whatever its keys; ``what`` says in errors what it should be.
+for _class in (_Loader, _Dumper):
+    _class.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+        list("-+.0123456789"),
+    )
 
-    Raises:
-        FileFormatError: Not YAML, or something else than a mapping.
-    """
-    text = read_text(path, what)
+LARGEST = np.finfo(float).max
+
+
+def _says_a_number(value: object) -> bool:
     try:
-        document = yaml.load(text, Loader=_Loader)  # a SafeLoader
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise FileFormatError(path, "YAML", reason, what) from None
-    if not isinstance(document, dict):
-        raise FileFormatError(path, "document", type(document).__name__, what)
-    return document
+        return isinstance(value, str) and bool(np.isfinite(float(value)))
+    except ValueError:
+        return False
 
 
-def read_document(path: str | Path, kind: str) -> dict[str, Any]:
-    """The mapping of a document of this kind, without its format line.
-
-    Raises:
-        FileFormatError: Not YAML, or not such a document.
-    """
-    what = f"a YAML file of calib_planner/{kind}"
-    document = read_mapping(path, what)
-    if document.get("format") != f"calib_planner/{kind}":
-        got = repr(document.get("format"))[:60]
-        advice = f"give a file that calib-planner {kind.replace('estimate', 'identify')} --output wrote"
-        raise FileFormatError(path, "format", got, f"calib_planner/{kind}", advice)
-    return {str(k): v for k, v in document.items() if k != "format"}
+def _null_as_nan(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_null_as_nan(v) for v in value]
+    return np.nan if value is None else value
 
 
-def check_keys(
-    path: str | Path, where: str, item: Any, required: Sequence[str], optional: Sequence[str] = ()
-) -> Mapping[str, Any]:
-    """``item`` as a mapping with all the required keys and none that is unknown."""
-    if not isinstance(item, Mapping):
-        wanted = f"a mapping with keys {', '.join(required)}"
-        raise FileFormatError(path, where, type(item).__name__, wanted)
-    for key in required:
-        if key not in item:
-            raise FileFormatError(path, where, f"no key {key!r}", f"the keys {', '.join(required)}")
-    for key in item:
-        if key not in required and key not in optional:
-            wanted = f"only {', '.join([*required, *optional])}"
-            advice = "was it written by another version?"
-            raise FileFormatError(path, where, f"unknown key {key!r}", wanted, advice)
-    return item
-
-
-def read_value(path: str | Path, key: str, kind: str, value: Any) -> Any:
-    """``value`` as the dataclass field annotated ``kind``: str, int, float, an array or names.
-
-    Raises:
-        FileFormatError: Of another kind.
-    """
-    reader, expected = _READERS[kind]
-    try:
-        return reader(value)
-    except (TypeError, ValueError, OverflowError):
-        raise FileFormatError(path, key, repr(value)[:60], expected) from None
-
-
-def _plain(value: Any) -> Any:
-    """Arrays and tuples to lists, NumPy numbers to Python's; non-finite floats stay."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    return value
-
-
-def _exactly(*kinds: type) -> Any:
-    def check(value: Any) -> Any:
+def _exactly(*kinds: type) -> Callable[[Any], Any]:
+    def read(value: Any) -> Any:
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             raise TypeError
         return kinds[0](value)
 
-    return check
+    return read
 
 
 def _names(value: Any) -> tuple[str, ...]:
@@ -127,221 +286,22 @@ def _names(value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _array(value: ArrayLike) -> np.ndarray:
-    array = np.asarray(value)
-    if array.size and array.dtype.kind not in "iuf":
-        raise TypeError
-    return array.astype(np.float64)
+def _numbers(kinds: str, dtype: type) -> Callable[[Any], FloatArray | IntArray]:
+    def read(value: Any) -> Any:
+        array = np.asarray(value)
+        if array.size and array.dtype.kind not in kinds:
+            raise TypeError
+        return array.astype(dtype)
+
+    return read
 
 
-def _whole_array(value: ArrayLike) -> np.ndarray:
-    array = np.asarray(value)
-    if array.size and array.dtype.kind not in "iu":
-        raise TypeError
-    return array.astype(np.int64)
-
-
-_READERS: dict[str, tuple[Any, str]] = {
+KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "str": (_exactly(str), "text"),
     "int": (_exactly(int), "a whole number"),
     "float": (_exactly(float, int), "a number"),
     "tuple[str, ...]": (_names, "a list of names"),
-    "FloatArray": (_array, "a list of numbers, or of rows of numbers of one length"),
-    "IntArray": (_whole_array, "a list of whole numbers"),
+    "FloatArray": (_numbers("iuf", np.float64), "a list of numbers, or of rows of numbers of one length"),
+    "IntArray": (_numbers("iu", np.int64), "a list of whole numbers"),
 }
-
-
-# ── Sections of YAML files that users write: known keys only, plain numbers, errors that name the key ───────
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Section:
-    """One mapping of a file.
-
-    Attributes:
-        path: The file, for errors.
-        where: Keys that lead here, with a dot at the end, or empty at the top.
-        values: Its content.
-    """
-
-    path: Path
-    where: str
-    values: Mapping[str, Any]
-
-    def only(self, keys: Sequence[str], required: Sequence[str] = ()) -> Section:
-        """Itself, once it is known to hold no other keys, and all the required ones."""
-        for key in self.values:
-            if key not in keys:
-                raise self.error(str(key), "an unknown key", f"only: {', '.join(keys)}")
-        for key in required:
-            if key not in self.values:
-                raise self.error(key, "nothing", f"this key, of: {', '.join(keys)}")
-        return self
-
-    def section(self, key: str) -> Section:
-        """The mapping below ``key``."""
-        value = self.values[key]
-        if not isinstance(value, Mapping):
-            raise self.error(key, repr(value)[:60], "a mapping of keys to values")
-        return Section(self.path, f"{self.where}{key}.", value)
-
-    def number(self, key: str, default: float | None = None) -> float:
-        """A number; text that is one (``3e-5``, which YAML takes for text) counts."""
-        if key not in self.values and default is not None:
-            return default
-        return self._number(key, self.values.get(key))
-
-    def numbers(self, key: str, length: int | None = None) -> FloatArray:
-        """(length,) a list of numbers."""
-        value = self.values.get(key)
-        if not isinstance(value, list) or not value or (length is not None and len(value) != length):
-            raise self.error(key, repr(value)[:60], f"a list of {length or 'one or more'} numbers")
-        return np.array([self._number(f"{key}[{i}]", v) for i, v in enumerate(value)])
-
-    def directions(self, key: str) -> FloatArray:
-        """(K, 3) one direction, or a list of them."""
-        value = self.values.get(key)
-        if isinstance(value, list) and value and isinstance(value[0], list):
-            rows = Section(self.path, self.where, {f"{key}[{i}]": row for i, row in enumerate(value)})
-            return np.array([rows.numbers(name, 3) for name in rows.values])
-        return self.numbers(key, 3)[None]
-
-    def angles(self, key: str, length: int) -> FloatArray:
-        """(length,) angles [rad], from ``key`` [rad] or ``key_deg`` [degrees]; a single one may be bare."""
-        degrees = f"{key}_deg"
-        if (key in self.values) == (degrees in self.values):
-            got = "both" if key in self.values else "neither"
-            raise self.error(key, got, f"either {key} [rad] or {degrees} [degrees]")
-        given = key if key in self.values else degrees
-        bare = length == 1 and not isinstance(self.values[given], list)
-        found = np.array([self.number(given)]) if bare else self.numbers(given, length)
-        return found if given == key else np.radians(found)
-
-    def truth(self, key: str, default: bool) -> bool:
-        """true or false."""
-        value = self.values.get(key, default)
-        if not isinstance(value, bool):
-            raise self.error(key, repr(value)[:60], "true or false")
-        return value
-
-    def text(self, key: str) -> str:
-        """Text that is not empty."""
-        value = self.values.get(key)
-        if not isinstance(value, str) or not value:
-            raise self.error(key, repr(value)[:60], "text")
-        return value
-
-    def error(self, key: str, got: str, expected: str) -> FileFormatError:
-        """What to raise about ``key``."""
-        return FileFormatError(self.path, f"{self.where}{key}", got, expected)
-
-    def made(self, make: Callable[[], T]) -> T:
-        """What ``make`` returns; an error about a value becomes one about this section of the file."""
-        try:
-            return make()
-        except FileFormatError:
-            raise
-        except InputError as error:
-            where = self.where + error.field
-            raise FileFormatError(self.path, where, error.got, error.expected, error.advice) from None
-
-    def _number(self, key: str, value: Any) -> float:
-        try:
-            if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-                raise ValueError
-            number = float(value)
-        except (ValueError, OverflowError):
-            raise self.error(key, repr(value)[:60], "a number") from None
-        if not np.isfinite(number):
-            raise self.error(key, repr(value)[:60], "a finite number")
-        return number
-
-
-# ── The border of robot files in YAML: every value comes out checked, or as an error that names its place ───
-
-
-def brief(item: Any) -> str:
-    """At most 80 characters, whatever comes: a few lines of YAML aliases can stand for gigabytes of text."""
-    return reprlib.repr(item)[:80]
-
-
-class YamlReader:
-    """Checks of the values of one document; holds the path for the errors, nothing else."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def document(self) -> Any:
-        """What the file holds, as plain values.
-
-        Raises:
-            FileFormatError: Not a text file, or not YAML.
-        """
-        try:
-            return yaml.safe_load(self.path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-            raise self.error("file", " ".join(str(error).split()), "readable YAML") from None
-
-    def error(self, where: str, got: object, expected: str, advice: str = "") -> FileFormatError:
-        return FileFormatError(self.path, where, got, expected, advice)
-
-    def mapping(self, where: str, item: Any, keys: Sequence[str], required: Sequence[str] = ()) -> dict[str, Any]:
-        if not isinstance(item, Mapping):
-            raise self.error(where, type(item).__name__, f"a mapping with keys {', '.join(keys)}")
-        for key in item:
-            if key not in keys:
-                raise self.error(where, f"unknown key {brief(key)}", f"only: {', '.join(keys)}")
-        for key in required:
-            if key not in item:
-                raise self.error(where, f"no key {key!r}", f"{key!r} to be given")
-        return dict(item)
-
-    def sequence(self, where: str, item: Any) -> list[Any]:
-        if not isinstance(item, list) or not item:
-            raise self.error(where, brief(item), "a list with at least one entry")
-        return item
-
-    def number(self, where: str, item: Any) -> float:
-        if isinstance(item, bool) or not isinstance(item, (int, float)) or not abs(item) <= np.finfo(float).max:
-            advice = ""
-            if isinstance(item, str) and _is_number(item):
-                advice = "YAML takes that for text: write 1.0e-3 instead of 1e-3, and no quotes"
-            raise self.error(where, brief(item), "a finite number", advice)
-        return float(item)
-
-    def vector(self, where: str, item: Any) -> FloatArray:
-        if not isinstance(item, list) or len(item) != 3:
-            raise self.error(where, brief(item), "three numbers")
-        return np.array([self.number(f"{where}[{i}]", v) for i, v in enumerate(item)])
-
-    def text(self, where: str, item: Any) -> str:
-        """A name; whole numbers are taken as written."""
-        if isinstance(item, bool) or not isinstance(item, (str, int)):
-            raise self.error(where, brief(item), "a name")
-        return str(item)
-
-    def choice(self, where: str, item: Any, valid: Collection[str]) -> str:
-        if not isinstance(item, str) or item not in valid:
-            raise self.error(where, brief(item), f"one of: {', '.join(valid)}")
-        return item
-
-    def names(self, where: str, item: Any, known: Collection[str]) -> tuple[str, ...]:
-        """A list of different names, all of them known."""
-        if not isinstance(item, list):
-            raise self.error(where, brief(item), "a list of parameter names")
-        for name in item:
-            if not isinstance(name, str) or name not in known:
-                raise self.error(where, brief(name), f"only: {', '.join(sorted(known))}")
-            if item.count(name) > 1:
-                raise self.error(where, f"{name!r} twice", "each name once")
-        return tuple(item)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+"""Annotation of a field → how its value is read, and what is expected."""

@@ -1,7 +1,9 @@
 """Where to measure: a plan problem, the verb ``plan``, the plan, and how good it provably is."""
 
 from calib_planner.planning.budget import Split, plan_for_accuracy, split_budget
+from calib_planner.planning.certify.prove import PROOF_STATUS
 from calib_planner.planning.constraints import (
+    Custom,
     JointRange,
     LineOfSight,
     MinimumHeight,
@@ -22,8 +24,15 @@ from calib_planner.planning.information import (
     smallest_size,
 )
 from calib_planner.planning.planner import Progress, plan
-from calib_planner.planning.problem import POSE_CRITERIA, Candidates, PlanPrior, PlanProblem, Search
+from calib_planner.planning.problem import (
+    POSE_CRITERIA,
+    Candidates,
+    PlanPrior,
+    PlanProblem,
+    Search,
+    usual_discrepancy,
+)
 from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
-from calib_planner.planning.result import KEYS, KINDS, Plan, PlanQuality
+from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlanQuality
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
 from calib_planner.planning.tour import DWELL, Pace, timetable, usual_pace, visiting_order

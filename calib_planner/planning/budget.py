@@ -62,7 +62,9 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
     for k in _sizes(smallest):
         if k >= smallest + TRIED and best is not None:
             break
-        found = _smallest_repetition(problem, k, accuracy)
+        # The least multiple of k that is not below ``fewest`` may be no fewer than what was found already.
+        beaten = best is not None and fewest > 0 and k * -(-fewest // k) >= best.measurements
+        found = None if beaten else _smallest_repetition(problem, k, accuracy)
         watch(min(k - smallest + 1, TRIED), TRIED)
         if found is None:
             continue

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_planner.arrays import FloatArray, check_number
-from calib_planner.robot import Robot
+from calib_planner.robot import Robot, is_nuisance
 from calib_planner.tracker import Noise
 
 FLAT_PRIOR = 1.0
@@ -96,5 +96,4 @@ class ModelDiscrepancy:
     def prior_std(self, robot: Robot) -> FloatArray:
         """(P,) prior standard deviation of each active parameter [m | rad]."""
         std = [self.length_std if p.unit == "m" else self.angle_std for p in robot.parameters]
-        placed = [n.startswith(("base.", "target_")) for n in robot.parameter_names]
-        return np.where(placed, FLAT_PRIOR, std)
+        return np.where([is_nuisance(n) for n in robot.parameter_names], FLAT_PRIOR, std)

@@ -33,7 +33,7 @@ from calib_planner.planning.criteria import (
 )
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.problem import PlanProblem
-from calib_planner.robot import Identifiability, Linearisation, Robot, analyse
+from calib_planner.robot import Identifiability, Linearisation, Robot, analyse, is_nuisance
 from calib_planner.tracker import Isotropic, Noise, covariance_gradient
 
 RANK_TOLERANCE = 1e-9
@@ -247,9 +247,9 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     prior = prior_rows.T @ prior_rows
     _check_enough(problem, jacobians[:, :, kept], prior[np.ix_(kept, kept)])
     robot = replace(problem.robot, joint_limits=feasibility.limits).with_parameters([names[i] for i in kept])
-    interest = tuple(
-        i for i, n in enumerate(robot.parameter_names) if not n.startswith(("base.", "target_"))
-    ) or tuple(range(len(kept)))
+    interest = tuple(i for i, n in enumerate(robot.parameter_names) if not is_nuisance(n)) or tuple(
+        range(len(kept))
+    )
     mask = np.isin(np.arange(len(kept)), interest)
     tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(kept)))
     if len(problem.test_pose_array):

@@ -173,7 +173,7 @@ class PlanProblem:
             put(self, "test_poses", np.empty((0, len(robot.joint_names))))
         else:
             poses = check_configurations("test_poses", self.test_poses, robot.joint_names)
-            _check_within_limits(robot, poses)
+            robot.check_within_limits("test_poses", poses)
             put(self, "test_poses", poses)
         count = len(self.test_pose_array)
         weights = check_array("weights", np.ones(count) if self.weights is None else self.weights, (count,))
@@ -221,17 +221,17 @@ class PlanProblem:
         return self.configurations * self.repetitions
 
 
-def _check_within_limits(robot: Robot, poses: FloatArray) -> None:
-    low, high = robot.joint_limits.T
-    outside = (poses < low - 1e-9) | (poses > high + 1e-9)
-    if outside.any():
-        k, j = (int(i) for i in np.argwhere(outside)[0])
-        raise InputError(
-            f"test_poses[{k}], joint {robot.joint_names[j]}",
-            f"{poses[k, j]:.6g}",
-            f"a value within the joint limits [{low[j]:.6g}, {high[j]:.6g}] rad or m",
-            "check units (degrees?) and joint order",
-        )
+def usual_discrepancy(
+    robot: Robot, criterion: str, candidates: Candidates | None, compound: Mapping[str, float] | None = None
+) -> ModelDiscrepancy | None:
+    """What a plan problem expects of the robot beyond its geometric model if the user says nothing about it.
+
+    A robot from a URDF is a real one, which errs systematically, and candidates show what it can be driven to.
+    Other robots, other criteria and requests without candidates get the paper's plain criterion (``None``).
+    """
+    plain = criterion == "test_pose" and not compound
+    applies = robot.from_urdf and plain and candidates is not None and not candidates.repeat
+    return ModelDiscrepancy() if applies else None
 
 
 def _check_compound(shares: Mapping[str, float]) -> dict[str, float]:

@@ -215,8 +215,6 @@ def person_factors(robot: Robot) -> FloatArray:
 VIEWS = (TrackerRange, TrackerElevation, ReflectorAcceptance, LineOfSight)
 """The constraints about the tracker."""
 LIMITS = "joint limits"
-ROUNDING = 1e-9
-"""Beyond a joint limit by less than this is on it [rad | m]."""
 NEVER = ("other objects in the cell", "the moves between the stops")
 """What nothing here can check."""
 
@@ -278,7 +276,7 @@ def check_stops(
     q = check_configurations("configurations", configurations, robot.joint_names)
     low, high = robot.joint_limits.T
     margins = np.minimum(q - low, high - q)
-    kept = {LIMITS: (margins >= -ROUNDING).all(axis=1)}
+    kept: dict[str, NDArray[np.bool_]] = {LIMITS: np.asarray(~robot.beyond_limits(q).any(axis=1))}
     seen: dict[str, NDArray[np.bool_]] = {}
     for constraint in constraints:
         masks = seen if isinstance(constraint, VIEWS) else kept
@@ -320,7 +318,7 @@ def _sight(robot: Robot, q: FloatArray, constraints: Sequence[Constraint], noise
     ups = [np.asarray(c.up) for c in (*views, noise) if isinstance(c, (TrackerElevation, LaserTracker))]
     normals = next((np.asarray(c.normal) for c in views if isinstance(c, ReflectorAcceptance)), None)
     heights = incidences = np.asarray(unknown)
-    if ups and all(np.allclose(u, ups[0], rtol=0, atol=ROUNDING) for u in ups):
+    if ups and all(np.allclose(u, ups[0], rtol=0, atol=1e-9) for u in ups):
         heights = elevations(station, ups[0], posture.targets)
     if normals is not None:
         turned = normals @ posture.tip_rotation.transpose(0, 2, 1)

@@ -15,7 +15,6 @@ import numpy as np
 from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import Estimate, IdentificationProblem, fit_placement, start_robot
-from calib_planner.measurements import Measurements
 from calib_planner.report.provenance import Provenance
 from calib_planner.report.scene import Scene, scene_of
 
@@ -44,9 +43,9 @@ class CalibrationReport:
         values: dict[str, Any] = plain(
             {
                 "estimate": self.estimate.to_dict(),
-                "required_accuracy": self.estimate.required_accuracy,
+                "required_accuracy": self.estimate.accuracy.required,
                 "distances_before": np.linalg.norm(self.before, axis=2),
-                "distances_after": np.linalg.norm(self.estimate.residuals, axis=2),
+                "distances_after": np.linalg.norm(self.estimate.residuals.vectors, axis=2),
                 "target_offsets": self.estimate.calibrated.target_offsets,
                 "scene": self.scene.to_dict(),
                 "provenance": self.provenance.to_dict(),
@@ -69,16 +68,13 @@ def calibration_report(
         InputError: The estimate is of other data or another robot.
     """
     robot, data = problem.robot, problem.data
-    same = estimate.parameters == robot.parameter_names and estimate.robot == robot.name
-    if not same or estimate.residuals.shape != data.p.shape:
+    same = estimate.fit.parameters == robot.parameter_names and estimate.calibrated.name == robot.name
+    if not same or estimate.residuals.vectors.shape != data.p.shape:
         size = "{} rows and {} parameters of {}"
-        got = size.format(len(estimate.residuals), len(estimate.parameters), estimate.robot)
+        got = size.format(len(estimate.residuals.vectors), len(estimate.fit.parameters), estimate.calibrated.name)
         valid = size.format(len(data), len(robot.parameter_names), robot.name)
         raise InputError("estimate", got, valid, "give the problem that the estimate answers")
-    points = np.array(data.p)
-    for rejected in estimate.rejected:
-        points[rejected["row"], rejected["target"] - 1] = np.nan
-    used = Measurements(data.joint_names, data.q, points, data.std)
+    used = data.without(estimate.points.rejected)
     nominal = fit_placement(start_robot(robot, data, robust=problem.loss == "robust"), used)
     before = np.asarray(data.p - nominal.positions(data.q))
     scene = scene_of(problem, estimate, before)

@@ -182,12 +182,12 @@ class Row(NamedTuple):
 
 def accuracy_charts(estimate: Estimate) -> tuple[Drawing, Drawing | None]:
     """Mean distances before and after; and what was predicted beside what was achieved, if anything was."""
-    required = estimate.required_accuracy if np.isfinite(estimate.required_accuracy) else None
+    required = estimate.accuracy.required if np.isfinite(estimate.accuracy.required) else None
     sets = validation_sets(estimate)
-    means = [Row("points of the fit", estimate.residual_before.mean, estimate.residual_after.mean)]
+    means = [Row("points of the fit", estimate.residuals.before.mean, estimate.residuals.after.mean)]
     means += [Row(name, v.before_mean, v.mean) for name, _, v in sets]
     promised = [Row(f"{name}: {length(v.rms)}", None, v.rms, (v.predicted_rms,)) for name, _, v in sets]
-    per = estimate.predicted_accuracy_per_test_pose
+    per = estimate.accuracy.predicted
     finite = per[np.isfinite(per)]
     if finite.size:
         what = "the test pose" if len(per) == 1 else f"{len(per)} test poses"
@@ -260,10 +260,10 @@ def drawn_points(report: CalibrationReport) -> Points:
     where = np.argwhere(report.problem.data.seen)
     seen = tuple(where.T)
     states = point_states(e)[seen]
-    chosen = thinned(np.where(states == USED, e.normalised_residuals[seen], np.inf), MOST_DOTS)
+    chosen = thinned(np.where(states == USED, e.residuals.normalised[seen], np.inf), MOST_DOTS)
     before = 1e3 * np.linalg.norm(report.before[seen], axis=1)[chosen]
-    after = 1e3 * np.linalg.norm(e.residuals[seen], axis=1)[chosen]
-    return Points(where[chosen, 0], before, after, e.normalised_residuals[seen][chosen], states[chosen])
+    after = 1e3 * np.linalg.norm(e.residuals.vectors[seen], axis=1)[chosen]
+    return Points(where[chosen, 0], before, after, e.residuals.normalised[seen][chosen], states[chosen])
 
 
 def residual_chart(report: CalibrationReport, points: Points) -> Drawing:
@@ -280,7 +280,7 @@ def residual_chart(report: CalibrationReport, points: Points) -> Drawing:
 
 def gate_chart(report: CalibrationReport, points: Points) -> Drawing:
     """Each residual in standard deviations of what it should be, and the gate."""
-    gate = report.estimate.gate
+    gate = report.estimate.residuals.gate
     largest = max(1.25 * gate, 1.05 * float(np.nanmax(points.normalised, initial=0.0)))
     far = largest > 5 * gate
     scale = _log_range(np.append(points.normalised, [gate, largest])) if far else (0.0, largest)
@@ -310,7 +310,7 @@ def joint_charts(report: CalibrationReport) -> list[Drawing]:
     parts = 1e3 * joint_residuals(report)
     highest = float(np.nanmax(np.abs(np.where(use[None, :, :, None], parts, 0.0)), initial=0.0)) or 1.0
     where = np.argwhere(use)
-    chosen = where[thinned(e.normalised_residuals[tuple(where.T)], MOST_DOTS // 2)]
+    chosen = where[thinned(e.residuals.normalised[tuple(where.T)], MOST_DOTS // 2)]
     charts = []
     for k in range(len(parts)):
         chart, q = _by_joint(e, k, data.q, 200, "mm", highest, "residuals against")
@@ -322,7 +322,7 @@ def _by_joint(
     e: Estimate, k: int, q: FloatArray, height: float, unit: str, highest: float, what: str
 ) -> tuple[Chart, FloatArray]:
     """The frame for values up to ± ``highest`` of joint k, and its coordinates there; q (N, joints) [rad | m]."""
-    name, turns = e.joint_names[k], bool(e.calibrated.joint_is_revolute[k])
+    name, turns = e.calibrated.joint_names[k], bool(e.calibrated.joint_is_revolute[k])
     shown = joint_factor(turns) * q[:, k]
     pad = 0.03 * float(np.ptp(shown)) or 1.0
     across = float(shown.min()) - pad, float(shown.max()) + pad
@@ -354,7 +354,7 @@ def _means(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def joint_residuals(report: CalibrationReport) -> FloatArray:
     """(joints, N, targets, 3) residual along the joint's motion, its axis, across [m]; NaN: no direction."""
-    robot, data, residuals = report.estimate.calibrated, report.problem.data, report.estimate.residuals
+    robot, data, residuals = report.estimate.calibrated, report.problem.data, report.estimate.residuals.vectors
     n, targets = data.seen.shape
     levers = robot.joint_jacobian(data.q).reshape(n, targets, 3, -1)
     axes = robot.posture(data.q).joint_axes
@@ -390,10 +390,10 @@ def correction_charts(report: CalibrationReport) -> list[Drawing]:
 
 def correlation_chart(estimate: Estimate) -> Drawing:
     """A square per pair of identified parameters: blue below zero, orange above, the stronger the darker."""
-    free = [i for i, v in enumerate(np.diag(estimate.covariance)) if v > 0]
-    std = np.sqrt(np.diag(estimate.covariance)[free])
-    matrix = estimate.covariance[np.ix_(free, free)] / np.outer(std, std)
-    cell, count, names = 12, len(free), [estimate.parameters[i] for i in free]
+    free = [i for i, v in enumerate(np.diag(estimate.fit.covariance)) if v > 0]
+    std = np.sqrt(np.diag(estimate.fit.covariance)[free])
+    matrix = estimate.fit.covariance[np.ix_(free, free)] / np.outer(std, std)
+    cell, count, names = 12, len(free), [estimate.fit.parameters[i] for i in free]
     margin = 8 + 6.2 * max(map(len, names), default=0)
     side = margin + cell * count + 2
     shades = np.rint(np.clip(matrix, -1, 1) * SHADES).astype(int)

@@ -21,7 +21,8 @@ from calib_planner.report.calibration import CalibrationReport, calibration_repo
 from calib_planner.report.provenance import Provenance
 from calib_planner.report.render import TEMPLATES, embedded, render
 from calib_planner.report.scene import still_picture
-from calib_planner.units import length, signed
+from calib_planner.robot import is_nuisance
+from calib_planner.units import MILLI_UNIT, length, signed
 
 HEADLINES = {
     "PASS": ("✓", "Good: apply it"),
@@ -31,9 +32,6 @@ HEADLINES = {
 """Mark and words of each level."""
 MOST_PAIRS = 40
 """Correlated pairs that are listed by name."""
-PLACEMENT = ("base.", "target_")
-"""Parameters whose nominal value is only a start: how far they moved says nothing."""
-SHOWN = {"m": "mm", "rad": "mrad"}
 
 
 def write_report(
@@ -73,7 +71,7 @@ def report_page(report: CalibrationReport) -> str:
         advice=advice,
         sets=[(name, f"estimate.{key}") for name, key, _ in charts.validation_sets(report.estimate)],
         parameters=_parameters(report.estimate),
-        placed=any(name.startswith(PLACEMENT) for name in report.estimate.parameters),
+        placed=any(map(is_nuisance, report.estimate.fit.parameters)),
         structure=_structure(report.estimate),
         ways=ways_to_apply(report),
         counts={
@@ -84,7 +82,7 @@ def report_page(report: CalibrationReport) -> str:
             "joint_dots": min(points, charts.MOST_DOTS // 2),
         },
         corrected=data["estimate"]["joint_corrections"] is not None,
-        shown_unit=SHOWN,
+        shown_unit=MILLI_UNIT,
         most_pairs=MOST_PAIRS,
         strong=STRONG,
         embedded=embedded,
@@ -130,20 +128,22 @@ def rounded(value: float, style: str) -> str:
 def _parameters(e: Estimate) -> list[dict[str, Any]]:
     """Index, name, unit and remarks of each parameter."""
     partners: dict[str, list[str]] = {}
-    for a, b, c in e.correlations:
+    for a, b, c in e.fit.correlations:
         for one, other in ((a, b), (b, a)):
             partners.setdefault(one, []).append(f"{other} ({signed(c, 2)})")
-    fixed = dict(zip(e.held, e.unidentifiable, strict=True))
+    fixed = dict(zip(e.observability.fixed, e.observability.unidentifiable, strict=True))
     return [
         {
             "index": i,
             "name": name,
-            "unit": SHOWN[unit],
+            "unit": MILLI_UNIT[unit],
             "fixed": fixed.get(name, ""),
             "partners": partners.get(name, []),
-            "sigmas": None if name.startswith(PLACEMENT) or not e.std[i] > 0 else abs(e.deviations[i] / e.std[i]),
+            "sigmas": None
+            if is_nuisance(name) or not e.fit.std[i] > 0
+            else abs(e.fit.deviations[i] / e.fit.std[i]),
         }
-        for i, (name, unit) in enumerate(zip(e.parameters, e.units, strict=True))
+        for i, (name, unit) in enumerate(zip(e.fit.parameters, e.fit.units, strict=True))
     ]
 
 
@@ -151,7 +151,7 @@ def _structure(e: Estimate) -> list[dict[str, Any]]:
     """Which trends the residuals show, with the key of each."""
     return [
         {"key": f"estimate.structure.{i}", "joint": s.joint, "kind": s.kind, "sure": s.probability < SIGNIFICANT}
-        for i, s in enumerate(e.structure)
+        for i, s in enumerate(e.diagnostics.structure)
     ]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray, IntArray, plain
 from calib_planner.identification import Estimate, IdentificationProblem
 from calib_planner.report.render import Drawing, Shape, shape
-from calib_planner.robot import Robot
+from calib_planner.robot import BASE, Robot
 
 MOST_ROBOTS = 300
 """Configurations whose robot can be shown."""
@@ -81,7 +81,7 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
     where = np.argwhere(data.seen)
     seen = tuple(where.T)
     states = point_states(estimate)[seen]
-    size = np.linalg.norm(estimate.residuals[seen], axis=1)
+    size = np.linalg.norm(estimate.residuals.vectors[seen], axis=1)
     worst = np.full(len(data), -1.0)
     np.maximum.at(worst, where[:, 0], np.where(states == USED, size, np.inf))
     rows = thinned(worst, MOST_ROBOTS)
@@ -92,12 +92,12 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
         rows=where[:, 0],
         targets=where[:, 1] + 1,
         points=(data.p[seen] - place) @ turn,
-        after=estimate.residuals[seen] @ turn,
+        after=estimate.residuals.vectors[seen] @ turn,
         before=before[seen] @ turn,
         states=states,
         robot_rows=rows,
         robots=bodies(robot, data.q[rows]),
-        test_robots=bodies(robot, estimate.test_poses.reshape(-1, len(robot.joint_names))),
+        test_robots=bodies(robot, estimate.accuracy.test_poses.reshape(-1, len(robot.joint_names))),
         target_count=len(robot.targets),
         tracker=_tracker(problem, turn, place),
     )
@@ -105,10 +105,10 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
 
 def point_states(estimate: Estimate) -> IntArray:
     """(N, targets) state of each point; ``USED`` where there is none."""
-    states = np.full(estimate.normalised_residuals.shape, USED)
-    for state, points in ((SUSPECT, estimate.suspects), (REJECTED, estimate.rejected)):
+    states = np.full(estimate.residuals.normalised.shape, USED)
+    for state, points in ((SUSPECT, estimate.points.suspects), (REJECTED, estimate.points.rejected)):
         for point in points:
-            states[point["row"], point["target"] - 1] = state
+            states[point.row, point.target - 1] = state
     return states
 
 
@@ -142,7 +142,7 @@ def _tracker(problem: IdentificationProblem, turn: FloatArray, place: FloatArray
     """From the instrument if it knows its station, else the origin of a frame that is not the base's own."""
     station = getattr(problem.instrument, "station", None)
     own = np.allclose(turn, np.eye(3), atol=1e-9) and np.allclose(place, 0.0, atol=1e-9)
-    if station is None and own and not any(n.startswith("base.") for n in problem.robot.parameter_names):
+    if station is None and own and not any(p.role == BASE for p in problem.robot.parameters):
         return None
     return np.asarray((np.zeros(3) if station is None else np.asarray(station)) - place) @ turn
 

@@ -18,4 +18,14 @@ from calib_planner.robot.identifiability import NO_LEVER, Identifiability, analy
 from calib_planner.robot.inverse import Goals, goals_of, residuals, solve
 from calib_planner.robot.linearisation import Linearisation, Posture
 from calib_planner.robot.origins import JointOrigins, Origin, joint_origins, not_in_origins, with_origins
-from calib_planner.robot.parameters import Parameter, check_joint_names
+from calib_planner.robot.parameters import (
+    BASE,
+    BASE_PARAMETERS,
+    TARGET,
+    Parameter,
+    check_joint_names,
+    grouped,
+    is_nuisance,
+    role_of,
+    target_parameters,
+)

@@ -29,6 +29,9 @@ from calib_planner.robot.parameters import Parameter, resolve_parameters
 
 MOST_PROGRAMS = 64
 """Programs that a robot remembers."""
+LIMIT_TOLERANCE = 1e-6
+"""A coordinate beyond its joint limit by less than this is on it [rad | m]: files and screens round limits and
+coordinates to six decimals."""
 
 
 def _no_file_reader(source: object, **links: object) -> Robot:
@@ -59,6 +62,7 @@ class Robot:
         levels: Level name → parameter names.
         parameter_names: Active parameters, the order of all Jacobian columns.
         source: What the robot was read from.
+        from_urdf: Whether it was read from a URDF, that is from the description of a real robot.
     """
 
     name: str
@@ -69,6 +73,7 @@ class Robot:
     levels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     parameter_names: tuple[str, ...] = ()
     source: str = ""
+    from_urdf: bool = False
 
     def __post_init__(self) -> None:
         joints = [e.joint for e in self.elements if e.joint is not None]
@@ -183,6 +188,28 @@ class Robot:
     def joint_is_revolute(self) -> NDArray[np.bool_]:
         """(joints,) whether each joint turns; the others slide."""
         return np.array(self._layout.joint_rotates)
+
+    def beyond_limits(self, q: FloatArray) -> NDArray[np.bool_]:
+        """(N, joints) [rad | m] → (N, joints) bool: which coordinates are outside the joint limits."""
+        low, high = self.joint_limits.T
+        return np.asarray((q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE))
+
+    def check_within_limits(self, field: str, q: FloatArray) -> None:
+        """Refuse configurations (N, joints) [rad | m] outside the joint limits.
+
+        Raises:
+            InputError: Names row and joint.
+        """
+        beyond = np.argwhere(self.beyond_limits(q))
+        if len(beyond):
+            i, j = (int(k) for k in beyond[0])
+            low, high = self.joint_limits[j]
+            raise InputError(
+                f"{field}[{i}], joint {self.joint_names[j]}",
+                f"{q[i, j]:.6g}",
+                f"a value within the joint limits [{low:.6g}, {high:.6g}] rad or m",
+                "check units (degrees?) and joint order",
+            )
 
     # ── where things are ─────────────────────────────────────────────────────────────────────────────
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_planner.arrays import FloatArray
+from calib_planner.robot.parameters import is_nuisance
 
 TOLERANCE = 1e-6
 """A unit column this close to the span of its predecessors is taken as dependent."""
@@ -72,7 +73,7 @@ def analyse(
     unit = np.divide(jacobian, scale, out=np.zeros(jacobian.shape), where=scale > 0)
     if len(unit) > unit.shape[1]:
         unit = np.linalg.qr(unit, mode="r")
-    first = [i for i, n in enumerate(names) if n.startswith(("base.", "target_"))]
+    first = [i for i, n in enumerate(names) if is_nuisance(n)]
     order = first + [i for i in range(len(names)) if i not in first]
     columns = np.ascontiguousarray(unit.T)
     basis = np.empty((min(unit.shape), len(unit)))

@@ -31,10 +31,10 @@ from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import estimate_to_message, plan_to_message
-from calib_planner.ros.model import Model, NotReady
+from calib_planner.ros.model import Model, NotReady, with_targets
 from calib_planner.ros.planning import constraints_of
 from calib_planner.ros.session import confined
-from calib_planner.ros.settings import CampaignParameters, unknown_words, with_topics
+from calib_planner.ros.settings import CampaignParameters, unknown_words
 from calib_planner.units import cut, listed
 
 SAME = ("budget", "batch", "validation", "minimum", "attempts", "most_failures", "exclusion", "sigma", "starts",
@@ -54,7 +54,7 @@ def problem_of(settings: CampaignParameters, model: Model | NotReady) -> Campaig
     if not settings.test_pose_rows:
         names = ", ".join(model.robot.joint_names)
         raise InputError("test_poses", "none", f"joint coordinates in the order {names}", "set the parameter")
-    robot = with_topics(model.robot, settings.targets or None, settings.unknown)
+    robot = with_targets(model.robot, settings.targets or None, settings.unknown)
     robot = robot.with_parameters(settings.parameters, unknown_words(settings.unknown))
     lengths = {len(row) for row in settings.test_pose_rows}
     if lengths != {len(robot.joint_names)}:
@@ -64,7 +64,7 @@ def problem_of(settings: CampaignParameters, model: Model | NotReady) -> Campaig
         robot,
         np.array(settings.test_pose_rows),
         settings.required_accuracy,
-        constraints=constraints_of(settings, robot),  # type: ignore[arg-type]
+        constraints=constraints_of(settings, robot),
         identification={"joint_corrections": settings.joint_corrections},
         **{name: getattr(settings, name) for name in SAME},
     )

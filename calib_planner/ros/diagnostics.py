@@ -163,20 +163,20 @@ def _estimate(campaign: Campaign) -> Finding:
         text = "no estimate yet" if found is None else found.message
         return (OK if found is None or found.missing else WARN), text, {}
     values = {
-        "parameters": len(found.parameters),
-        "rank": found.rank,
+        "parameters": len(found.fit.parameters),
+        "rank": found.observability.rank,
         "condition": f"{condition_of(found):.3g}",
-        "points used": found.used,
-        "outliers": len(found.rejected),
-        "noise of a coordinate [m]": f"{found.sigma:.3g}",
-        "residual rms [m]": f"{found.residual_after.rms:.3g}",
-        "predicted accuracy [m]": f"{found.predicted_accuracy:.3g}",
+        "points used": found.points.used,
+        "outliers": len(found.points.rejected),
+        "noise of a coordinate [m]": f"{found.noise.sigma:.3g}",
+        "residual rms [m]": f"{found.residuals.after.rms:.3g}",
+        "predicted accuracy [m]": f"{found.accuracy.overall:.3g}",
         "verdict": found.verdict.level,
-        "seconds": f"{found.seconds:.4f}",
+        "seconds": f"{found.diagnostics.seconds:.4f}",
     }
     reasons = "; ".join(r.text for r in found.verdict.reasons if r.level != "PASS")
-    level = OK if found.status == "ok" else WARN
-    return level, reasons or found.message, values
+    level = OK if found.fit.status == "ok" else WARN
+    return level, reasons or found.fit.message, values
 
 
 def _store(campaign: Campaign) -> Finding:

@@ -1,4 +1,11 @@
-"""Which plans a robot can execute: the same for the simulated one and for the adapter of a real one."""
+"""Executing plans: which ones a robot can execute, and one ``ExecutePlan`` goal at a time that always ends.
+
+``check_executable`` serves the simulated robot and the adapter of a real one alike.
+
+A goal of ``PlanExecution`` ends with the robot's result, or as *lost*: nothing was heard of it (no answer, no
+feedback) for ``silence`` seconds. A lost goal may be running all the same; it is cancelled by the id that
+``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called in the executor's thread.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +14,6 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from action_msgs.srv import CancelGoal
 from calib_planner_msgs.action import ExecutePlan
 from rclpy.action import ActionClient
@@ -20,14 +26,14 @@ from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.units import cut
 
 MOST_STANDSTILLS = 100_000
-"""Standstills of one plan; at a second each that is more than a day."""
+"""Standstills of one plan, at most; at a second each that is more than a day."""
 
 
 def check_executable(plan: Plan, robot: Robot) -> None:
     """Refuse a plan that this robot cannot execute.
 
     Raises:
-        InputError: Other robot or joints, a configuration outside the limits, or standstills without end.
+        InputError: Another robot, other joints, a configuration outside the limits, or too many standstills.
     """
     if plan.robot != robot.name:
         raise UnknownNameError("plan.robot", plan.robot, [robot.name])
@@ -36,18 +42,8 @@ def check_executable(plan: Plan, robot: Robot) -> None:
     if plan.measurements > MOST_STANDSTILLS:
         expected = f"at most {MOST_STANDSTILLS}"
         raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
-    low, high = robot.joint_limits.T
-    outside = (plan.configurations < low - 1e-6) | (plan.configurations > high + 1e-6)
-    if outside.any():
-        i, j = (int(k) for k in np.argwhere(outside)[0])
-        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
-        raise InputError(f"plan.configurations, row {i}", f"{plan.configurations[i, j]:.4f}", expected)
+    robot.check_within_limits("plan.configurations", plan.configurations)
 
-
-# ── One ``ExecutePlan`` goal at a time, with an end whatever the robot's side does ──────────────────────────
-# A goal ends with the robot's result, or *lost*: nothing was heard of it (no answer, no feedback) for ``silence``
-# seconds. What is lost may be running all the same; it is cancelled under the name that we gave it, as soon as
-# anybody listens. Everything here is called in the thread of the executor.
 
 RESULTS = {
     ExecutePlan.Result.SUCCESS: "done",
@@ -67,7 +63,7 @@ class Ended:
 
 
 class PlanExecution:
-    """See the module; made in ``configure`` of ``node``."""
+    """Sends goals to ``action``; made in ``configure`` of ``node``."""
 
     def __init__(self, node: ManagedNode[Any], action: str) -> None:
         self._client = ActionClient(node, ExecutePlan, action)
@@ -91,11 +87,11 @@ class PlanExecution:
 
     @property
     def begun(self) -> bool:
-        """Whether the robot has told how far it is; to accept a goal is not to do it."""
+        """Whether there was feedback: a robot that accepts a goal need not execute it."""
         return self._begun
 
     def send(self, goal: ExecutePlan.Goal) -> None:
-        """Begin; the one before must have ended."""
+        """Begin a goal; the one before must have ended."""
         name = UUID(uuid=list(uuid.uuid4().bytes))
         self._goal, self._ended, self._begun, self._cancelling = name, None, False, False
         self._heard = time.monotonic()
@@ -103,7 +99,7 @@ class PlanExecution:
         sent.add_done_callback(lambda future: self._answered(name, future))
 
     def cancel(self) -> None:
-        """Ask for an early end, once; it is heard of by ``poll``."""
+        """Ask once for an early end; ``poll`` tells of it."""
         if self._goal is None or self._cancelling:
             return
         self._cancelling = True
@@ -111,7 +107,11 @@ class PlanExecution:
         self._cancel(self._goal)
 
     def poll(self, silence: float) -> Ended | None:
-        """How the goal ended, told once; ``None`` while it runs."""
+        """How the goal ended, told once; ``None`` while it runs.
+
+        Args:
+            silence: Longest time without an answer or feedback [s].
+        """
         if self._goal is not None and self._ended is None and time.monotonic() - self._heard > silence:
             self._cancel(self._goal)
             self._ended = Ended("lost", f"nothing heard from {self.action} for {silence:g} s")

@@ -1,10 +1,11 @@
-"""The base of our nodes: a lifecycle node that starts by itself, says why it cannot, and does not fall over.
+"""The base of the nodes: a lifecycle node that starts by itself, says why it cannot start, and survives
+exceptions.
 
-A node states what it does in four hooks: ``configure`` makes everything it needs from its parameters,
-``activate`` begins, ``deactivate`` ends what is under way, ``clean_up`` forgets. A hook that raises is answered
-by FAILURE with the reason on the log; the node stays and can be configured again. What is made in ``configure``
-or ``activate`` (publishers, subscriptions, services, timers, action servers) is destroyed on the way back, also
-from half the way, and takes QoS overrides (see ``qos``); ``undo_with`` adds other things to that list.
+A node implements four hooks: ``configure`` makes everything that the node needs from its parameters, ``activate``
+begins its work, ``deactivate`` ends what is under way, ``clean_up`` forgets. If a hook raises, the transition
+fails and the reason is logged; the node stays and can be configured again. What is made in ``configure`` or
+``activate`` (publishers, subscriptions, services, timers, action servers) is destroyed on the way back, also from
+half the way, and takes QoS overrides (see ``qos``); ``undo_with`` adds other things to that list.
 
 With the parameter ``autostart`` (the default) the node goes to *active* as soon as it spins, so that it can be
 run without a lifecycle manager; with ``autostart: false`` a manager drives it by ``~/change_state``.
@@ -22,12 +23,11 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionClient, ActionServer
+from rclpy.action import ActionServer
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.service import Service
@@ -38,6 +38,7 @@ from calib_planner.errors import CalibPlannerError, UnknownNameError
 from calib_planner.ros.parameters import QOS, NodeParameters, parameter
 from calib_planner.ros.qos import REQUESTS, overridable, own
 from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
+from calib_planner.ros.rclpy_ext.lifecycle import TidyLifecycleNode, given_parameters
 from calib_planner.units import cut
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -45,7 +46,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 @dataclass(frozen=True)
 class LifecycleParameters:
-    """The parameters that every node has; theirs inherit from it."""
+    """The parameters that every node has; those of a node inherit from it."""
 
     autostart: bool = parameter(
         True, "go to active by itself; false: a lifecycle manager decides", read_only=True
@@ -55,19 +56,19 @@ class LifecycleParameters:
 P = TypeVar("P", bound=LifecycleParameters)
 
 
-class ManagedNode(LifecycleNode, Generic[P]):
-    """See the module.
+class ManagedNode(TidyLifecycleNode, Generic[P]):
+    """A node with hooks.
 
     Args:
-        name: Of the node.
+        name: Name of the node.
         defaults: Its parameters.
-        context: ROS context; default the global one.
+        context: ROS context; by default the global one.
         overrides: Parameter values that win over those of files and the command line.
 
     Attributes:
         settings: The parameters; ``settings.value`` is the current dataclass.
         failure: Why the last transition failed; empty if it did not.
-        autostarted: Whether starting by itself was tried and has ended, one way or the other.
+        autostarted: Whether the node has tried to start by itself, with or without success.
 
     Raises:
         InputError: A parameter given at start is unknown or has an unusable value.
@@ -81,8 +82,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self._made: list[ExitStack] = []  # before rclpy makes its own services, by our methods
         self.failure, self.autostarted, self._ending = "", False, False
         super().__init__(name, context=context, parameter_overrides=list(overrides))
-        service = self._service_change_state
-        service.callback = self._safe_service(service.callback)
+        self.guard_change_state(self._safe_service)
         try:
             self.settings: NodeParameters[P] = NodeParameters(self, defaults)
         except Exception:
@@ -108,52 +108,27 @@ class ManagedNode(LifecycleNode, Generic[P]):
         """Forget what ``configure`` made, besides publishers, services and so on."""
 
     def undo_with(self, callback: Callable[..., Any], *args: Any) -> None:
-        """In ``configure`` or ``activate``: have ``callback(*args)`` called on the way back, last one first."""
+        """In ``configure`` or ``activate``: call ``callback(*args)`` on the way back, the last one first."""
         self._made[-1].callback(callback, *args)
 
     @property
-    def state(self) -> str:
-        """``unconfigured``, ``inactive``, ``active``, ``finalized`` or the name of a transition.
-
-        A destroyed node is ``finalized``; a thread that it left behind may ask.
-        """
-        try:
-            with self._state_machine:
-                return str(self._state_machine.current_state[1])
-        except InvalidHandle:
-            return "finalized"
-
-    @property
     def is_active(self) -> bool:
-        """Whether the node is at work."""
+        """Whether the state is *active*."""
         return self.state == "active"
 
     def close(self) -> bool:
-        """End everything, when the process ends; whether that took no longer than a moment.
+        """End everything when the process ends; returns whether nothing is under way any more.
 
-        Publishers and services stay: a thread may be about to use them, and the process takes them along.
+        Publishers and services stay, since a thread may be about to use them; they end with the process.
         """
         self._ending = True
         self._leave_all()
         return True
 
-    def destroy_node(self) -> None:
-        """As rclpy's, and what rclpy leaves to the garbage collector: state machine, action servers and clients.
-
-        Each of them keeps the node alive below Python. When the collector destroys it at last, it takes the entry
-        of its name in rcl's table of log publishers along. If that is the entry of another node of this name by
-        then, the other one works on, but nothing of what it logs is heard on ``/rosout`` any more.
-        """
-        for waitable in list(self.waitables):
-            if isinstance(waitable, (ActionServer, ActionClient)):
-                waitable.destroy()
-        super().destroy_node()
-        self._state_machine.destroy_when_not_in_use()
-
-    # ── transitions ──────────────────────────────────────────────────────────────────────────────────
+    # ── transitions, called by rclpy ─────────────────────────────────────────────────────────────────
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by rclpy."""
+        """Run ``configure``; from now on what is taken at configure cannot be changed."""
         self.settings.in_use = True
         result = self._enter("configure")
         self.settings.in_use = result == SUCCESS
@@ -162,31 +137,21 @@ class ManagedNode(LifecycleNode, Generic[P]):
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by rclpy."""
+        """Run ``activate``."""
         return self._enter("activate")
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by rclpy."""
+        """Run ``deactivate``."""
         self._leave("deactivate")
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by rclpy."""
-        self._leave("clean_up")
-        self.settings.in_use = False
-        return SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by rclpy."""
+        """Run whatever is left of ``deactivate`` and ``clean_up``."""
         self._leave_all()
         self.settings.in_use = False
         return SUCCESS
 
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by rclpy."""
-        self._leave_all()
-        self.settings.in_use = False
-        return SUCCESS
+    on_shutdown = on_error = on_cleanup
 
     def _leave_all(self) -> None:
         while self._made:
@@ -206,7 +171,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
         return SUCCESS
 
     def _leave(self, hook: str) -> None:
-        """Run ``deactivate`` or ``clean_up``, and destroy what was made for it, come what may."""
+        """Run ``deactivate`` or ``clean_up``, and destroy what was made, whatever raises."""
         self._attempt(getattr(self, hook))
         self._attempt(self._made.pop().close)
 
@@ -229,9 +194,9 @@ class ManagedNode(LifecycleNode, Generic[P]):
         self.autostarted = True
 
     def _report_unused_overrides(self) -> None:
-        for name in self._parameter_overrides:
+        for name in given_parameters(self):
             if name.startswith(QOS) and not self.has_parameter(name) and "/parameter_events" not in name:
-                valid = sorted(n for n in self._parameters if n.startswith(QOS))
+                valid = sorted(n for n in self.get_parameters_by_prefix("") if n.startswith(QOS))
                 self.get_logger().warning(f"{UnknownNameError('parameter', cut(name, 200), valid)}")
 
     # ── what is made in a transition is destroyed on the way back ────────────────────────────────────
@@ -286,7 +251,7 @@ class ManagedNode(LifecycleNode, Generic[P]):
     def create_action_server(
         self, kind: Any, name: str, execute: Callable[..., Any], **others: Any
     ) -> ActionServer:
-        """An action server; ``execute`` answers its faults itself, since only it knows its result's words."""
+        """An action server; ``execute`` answers its own faults, since only it knows the fields of its result."""
         deep = {f"{part}_service_qos_profile": REQUESTS for part in ("goal", "cancel", "result")}
         made = LastingActionServer(self, kind, name, execute, **(deep | others))
         if self._made:
@@ -320,21 +285,21 @@ class ManagedNode(LifecycleNode, Generic[P]):
         return safe
 
     def _say(self, error: Exception) -> None:
-        # Without a context the process is ending, and nothing can be done or said.
+        # Without a context the process is ending, and nothing can be logged.
         if self.context.ok():
             self.get_logger().error(_reason(error), throttle_duration_sec=1.0)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """As rclpy's; an unknown name is refused with the closest valid one instead of an exception."""
+        """As rclpy's, which raises for an unknown name: here it is refused with the closest valid one."""
         for given in parameter_list:
-            if given.name not in self._parameters:
+            if not self.has_parameter(given.name):
                 error = UnknownNameError("parameter", cut(given.name, 100), self.settings.names)
                 return SetParametersResult(successful=False, reason=str(error))
         return super().set_parameters_atomically(parameter_list)
 
 
 def failed(kind: Any, reason: str) -> Any:
-    """A service's response of type ``kind`` that says that it could not be done."""
+    """A response of type ``kind`` that says that the service failed."""
     response = kind()
     if hasattr(response, "message"):
         response.message = reason

@@ -1,42 +1,40 @@
-"""Which robot the planner plans for: a shipped one by name, or the URDF heard on ``robot_description``.
+"""Which robot a node works for: a shipped one by name, or the URDF heard on ``robot_description``.
 
-Anyone on the graph may publish a robot description, so it is bounded before it is parsed (length, number of
-links and joints), and ``robot.urdf`` refuses document types, which are the way to entities. What is refused
-changes nothing: the robot before it stays, heard or by name, or whoever sends rubbish could take the planner out
-of service. Since the refused one may be the machine that is there, ``refusal`` is said beside every plan until a
-description is accepted again; and no machine executes a plan of another robot's name.
+Anyone on the graph may publish a robot description. It is therefore bounded before it is parsed (length, number
+of links and joints), and the reader of URDFs refuses document types, which are the way to entities. A description
+that is refused changes nothing: the robot before it stays, or a bad description could take the planner out of
+service. Since the refused one may describe the robot that is there, ``ModelSource.refusal`` is said beside every
+plan until a description is accepted again; and no robot executes a plan for a robot of another name.
+
+The identifier keeps the text from which its robot was read with its measurements: if the model changed under
+them, they would say something else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from calib_planner.arrays import FloatArray, frozen
-from calib_planner.errors import CalibPlannerError, FileFormatError
-from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, stored_model
+from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
+from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, shipped_robots, stored_model
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
-from calib_planner.ros.settings import (
-    IdentifierParameters,
-    PlannerParameters,
-    load_shipped,
-    unknown_words,
-    with_topics,
-)
+from calib_planner.ros.settings import IdentifierParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
 
 TOPIC = "robot_description"
 LONGEST_TEXT = 4_000_000
-"""Characters of a description; the longest in common use have some 400 000."""
+"""Characters of a description, at most; the longest in common use have some 400 000."""
 MOST_ITEMS = 2000
-"""Links, and joints, of a description."""
+"""Links, and joints, of a description, at most."""
 MOST_MOVING = 64
-"""Moving joints of the chain."""
+"""Moving joints of the chain, at most."""
 LONGEST_NAME = 200
+DEFAULT_LEVEL = "lengths+offsets"
+"""What is identified while neither a parameter nor a plan says so."""
 
 
 class NotReady(CalibPlannerError):
@@ -45,34 +43,54 @@ class NotReady(CalibPlannerError):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A robot and what else is known of it.
+    """A robot and the speed limits of its description.
 
     Attributes:
-        robot: Its geometry.
-        speeds: (joints,) speed limits of the description [rad/s | m/s]; infinite where none is known.
-        described: Whether it was heard, not loaded by name.
+        robot: The robot.
+        speeds: (joints,) speed limits [rad/s | m/s]; infinite where none is known.
     """
 
     robot: Robot
     speeds: FloatArray
-    described: bool = False
 
 
 def shipped_model(name: str, parameters: str | Sequence[str], unknown: str) -> Model:
-    """A robot by name.
+    """A shipped robot without speed limits; errors as ``load_shipped``."""
+    robot = load_shipped(name, parameters, unknown)
+    return Model(robot, _no_limits(robot))
+
+
+def load_shipped(
+    name: str, parameters: str | Sequence[str], unknown: str = "", targets: int | None = None
+) -> Robot:
+    """A shipped robot with free parameters; paths are refused, since anyone may send a name.
+
+    Args:
+        name: Name of the robot.
+        parameters: A level or names.
+        unknown: What else is unknown, see ``unknown_words``.
+        targets: Number of targets, see ``with_targets``.
 
     Raises:
         UnknownNameError: Not a shipped robot, or it has no such parameters.
     """
-    words = unknown_words(unknown)
-    robot = _loaded(name).with_parameters(parameters, words)
-    return Model(robot, _no_limits(robot))
+    if name not in shipped_robots():
+        raise UnknownNameError("robot", name, shipped_robots())
+    return with_targets(Robot.load(name), targets, unknown).with_parameters(parameters, unknown_words(unknown))
 
 
-@lru_cache(maxsize=16)
-def _loaded(name: str) -> Robot:
-    """Read once: a request that names a robot should not wait for its file."""
-    return load_shipped(name, "full")
+def with_targets(robot: Robot, targets: int | None, unknown: str) -> Robot:
+    """The robot with as many targets; another number than its own puts all at the tip, with ``tool`` unknown.
+
+    Raises:
+        InputError: ``unknown`` does not hold ``tool``.
+    """
+    if targets is None or targets == len(robot.targets):
+        return robot
+    if "tool" not in unknown_words(unknown):
+        expected = f"{len(robot.targets)} topics, as the robot has targets"
+        raise InputError("tracker_topics", f"{targets} topics", expected, "or set unknown to tool")
+    return robot.with_targets(np.zeros((targets, 3)))
 
 
 def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model:
@@ -90,7 +108,7 @@ def described_model(text: str, base_link: str = "", tip_link: str = "") -> Model
         if len(name) > LONGEST_NAME or not name.isprintable():
             raise FileFormatError(TOPIC, "name", brief(name, 40), f"at most {LONGEST_NAME} printable characters")
     speeds = parse_speed_limits(text, TOPIC, robot.joint_names)
-    return Model(robot, _no_limits(robot) if speeds is None else speeds, described=True)
+    return Model(robot, _no_limits(robot) if speeds is None else speeds)
 
 
 def _no_limits(robot: Robot) -> FloatArray:
@@ -107,29 +125,25 @@ def _check_size(text: str) -> None:
 
 
 class ModelSource:
-    """The model in force; the only thing here that changes, by assignment of one value at a time.
+    """The model in use by a node that plans; it changes by assignment of one value at a time.
 
     Attributes:
-        refusal: Why the newest description was refused and what stays; empty if it was not.
+        model: The model, or why there is none.
+        refusal: Why the newest description was refused and which robot stays; empty if it was not refused.
     """
 
-    def __init__(self, settings: PlannerParameters) -> None:
+    def __init__(self, settings: PlanParameters) -> None:
         self._settings = settings
         self._text = self.refusal = ""
-        self._found: Model | NotReady = NotReady(
+        self.model: Model | NotReady = NotReady(
             f"no robot yet: publish a URDF on {TOPIC} (latched), or set the parameter robot; "
             "a request may also name a shipped robot"
         )
         if settings.robot:
-            self._found = shipped_model(settings.robot, settings.parameters, settings.unknown)
-
-    @property
-    def model(self) -> Model | NotReady:
-        """The model, or why there is none."""
-        return self._found
+            self.model = shipped_model(settings.robot, settings.parameters, settings.unknown)
 
     def take(self, text: str) -> Model | None:
-        """Take a description; ``None`` if it is the one in force.
+        """Take a description; ``None`` if it is the one in use.
 
         Raises:
             CalibPlannerError: It is refused; ``refusal`` says what that means.
@@ -138,32 +152,24 @@ class ModelSource:
             self.refusal = ""
             return None
         try:
-            found = described_model(text, self._settings.base_link, self._settings.tip_link)
+            model = described_model(text, self._settings.base_link, self._settings.tip_link)
         except CalibPlannerError as error:
             self.refusal = f"{TOPIC} refused: {cut(error, 800)}"
-            if isinstance(self._found, Model):
-                self.refusal += f"; {self._found.robot.name} stays the robot"
+            if isinstance(self.model, Model):
+                self.refusal += f"; {self.model.robot.name} stays the robot"
             else:
-                self._found = NotReady(self.refusal)
+                self.model = NotReady(self.refusal)
             raise
-        self._found, self._text, self.refusal = found, text, ""
-        return found
-
-
-# ── Which robot the identifier identifies, with the text that says so ───────────────────────────────────────
-# A shipped robot by name, a URDF heard on ``robot_description``, or the one that a campaign in the store belongs
-# to. The text is kept with the campaign: a model that changes under it would change what its measurements say.
-
-DEFAULT_LEVEL = "lengths+offsets"
-"""What is identified while neither a parameter nor a plan says so."""
+        self.model, self._text, self.refusal = model, text, ""
+        return model
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedModel:
-    """A robot with a target per topic.
+    """The robot of the identifier, with a target per topic.
 
     Attributes:
-        robot: Its active parameters are those of the node's parameter.
+        robot: The robot; its free parameters are those of the node's parameter.
         stored: What a store says of it.
         settings: The node's parameters.
     """
@@ -174,11 +180,11 @@ class IdentifiedModel:
 
     @property
     def urdf(self) -> str:
-        """The URDF it was read from; empty if it was not read from one."""
+        """The URDF that it was read from; empty if it was not read from one."""
         return self.stored.source if self.stored.origin == TOPIC else ""
 
     def follow(self, plan: Plan) -> Robot:
-        """The robot with the parameters that a plan is for, unless the node's own say otherwise.
+        """The robot with the free parameters of a plan, unless the node's own say otherwise.
 
         Raises:
             UnknownNameError: It has no such parameters.
@@ -188,27 +194,20 @@ class IdentifiedModel:
 
 
 def first_model(settings: IdentifierParameters) -> IdentifiedModel | None:
-    """The model to begin with; ``None`` if a description has to be waited for.
+    """The model to begin with: that of the store, or that of the parameter; ``None`` to wait for a description.
 
     Raises:
-        CalibPlannerError: There is no such robot, or the store cannot be used.
+        CalibPlannerError: There is no such robot, it has no such parameters, or the store cannot be used.
     """
     if settings.use_robot_description:
         stored = stored_model(settings.store_folder)
         if stored is not None and stored.origin == TOPIC:
             return heard_model(stored.source, settings)
-    return shipped_robot_model(settings) if settings.robot else None
-
-
-def shipped_robot_model(settings: IdentifierParameters) -> IdentifiedModel:
-    """The robot that the parameter ``robot`` names.
-
-    Raises:
-        CalibPlannerError: There is no such robot, or it has no such parameters or targets.
-    """
-    level, topics = settings.parameters or DEFAULT_LEVEL, len(settings.tracker_topics)
-    robot = load_shipped(settings.robot, level, settings.unknown, topics)
-    return _model(robot, read_text(robot.source, "a robot YAML"), settings.robot, settings)
+    if not settings.robot:
+        return None
+    level, targets = settings.parameters or DEFAULT_LEVEL, len(settings.tracker_topics)
+    robot = load_shipped(settings.robot, level, settings.unknown, targets)
+    return _identified(robot, read_text(robot.source, "a robot YAML"), settings.robot, settings)
 
 
 def heard_model(text: str, settings: IdentifierParameters) -> IdentifiedModel:
@@ -217,12 +216,12 @@ def heard_model(text: str, settings: IdentifierParameters) -> IdentifiedModel:
     Raises:
         CalibPlannerError: It is refused.
     """
-    found = described_model(text, settings.base_link, settings.tip_link).robot
-    robot = with_topics(found, len(settings.tracker_topics), settings.unknown)
-    level = settings.parameters or DEFAULT_LEVEL
-    return _model(robot.with_parameters(level, unknown_words(settings.unknown)), text, TOPIC, settings)
+    described = described_model(text, settings.base_link, settings.tip_link).robot
+    robot = with_targets(described, len(settings.tracker_topics), settings.unknown)
+    robot = robot.with_parameters(settings.parameters or DEFAULT_LEVEL, unknown_words(settings.unknown))
+    return _identified(robot, text, TOPIC, settings)
 
 
-def _model(robot: Robot, text: str, origin: str, settings: IdentifierParameters) -> IdentifiedModel:
+def _identified(robot: Robot, text: str, origin: str, settings: IdentifierParameters) -> IdentifiedModel:
     stored = StoredModel(robot.name, robot.joint_names, len(robot.targets), text, origin)
     return IdentifiedModel(robot, stored, settings)

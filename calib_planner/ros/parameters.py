@@ -1,14 +1,15 @@
-"""Node parameters, declared once from a frozen dataclass: type, default, description, unit, range, choices.
+"""Node parameters, declared once by a frozen dataclass: type, default, description, unit, range, choices.
 
-A field is a parameter; ``parameter(...)`` gives it its descriptor. ``NodeParameters`` declares them, refuses
-with the reason what is unknown, of another type or out of range, and holds the current values as one
-immutable object. ROS itself drops unknown names in silence: a misspelt one would leave its default in place.
+Each field is a parameter. It is made with ``parameter`` or, in a class of settings of the library, with
+``arrays.ranged``; what the library declares is taken by the transition ``configure``. ``NodeParameters`` declares
+the parameters, refuses a name that is unknown and a value of another type or out of range, says why, and holds
+the current values as one immutable object. ROS itself drops unknown names given at start without a word.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import Field, field, fields, replace
 from typing import Any, Generic, TypeVar
 
@@ -22,15 +23,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.ros.rclpy_ext.lifecycle import given_parameters
 from calib_planner.units import brief, cut
 
 P = TypeVar("P")
 
 BUILT_IN = ("use_sim_time", "start_type_description_service")
 QOS = "qos_overrides."
-"""What starts so is declared by rclpy when the topic is created; see ``qos``."""
+"""rclpy declares parameters that begin so when the topic is created; see ``qos``."""
 LONGEST_TEXT, LONGEST_LIST = 4096, 1000
-"""A parameter is no place for data: characters of a text and items of a list, at most."""
+"""Characters of a text and items of a list, at most: a parameter is no place for data."""
 TYPES = {
     bool: (Parameter.Type.BOOL, "true or false"),
     int: (Parameter.Type.INTEGER, "a whole number"),
@@ -43,10 +45,10 @@ TYPES = {
 def parameter(
     default: Any,
     description: str,
-    *,
     unit: str = "",
     low: float | None = None,
     high: float | None = None,
+    *,
     choices: Sequence[str] = (),
     read_only: bool = False,
     at_configure: bool = False,
@@ -56,22 +58,14 @@ def parameter(
     Args:
         default: Its type is the parameter's: bool, int, float, str, or a tuple of str.
         description: For people, without unit and range.
-        unit: SI.
+        unit: SI unit.
         low, high: Smallest and largest value; both or neither.
         choices: The only values of a text.
-        read_only: Never changes after start.
-        at_configure: Is taken by the transition ``configure`` and cannot be changed while it is in use.
+        read_only: Whether it never changes after start.
+        at_configure: Whether the transition ``configure`` takes it, so that it cannot change while in use.
     """
-    metadata = {
-        "description": description,
-        "unit": unit,
-        "low": low,
-        "high": high,
-        "choices": tuple(choices),
-        "read_only": read_only,
-        "at_configure": at_configure,
-    }
-    return field(default=default, metadata=metadata)
+    metadata = {"description": description, "unit": unit, "low": low, "high": high, "choices": tuple(choices)}
+    return field(default=default, metadata=metadata | {"read_only": read_only, "at_configure": at_configure})
 
 
 def constraints_text(item: Field[Any]) -> str:
@@ -79,38 +73,43 @@ def constraints_text(item: Field[Any]) -> str:
     data, words = item.metadata, []
     if data["low"] is not None:
         words.append(f"{data['low']:g} to {data['high']:.15g}")
-    if data["choices"]:
+    if data.get("choices"):
         words.append("one of: " + ", ".join(data["choices"]))
-    if data["read_only"]:
+    if data.get("read_only"):
         words.append("fixed after start")
-    if data["at_configure"]:
+    if taken_at_configure(item):
         words.append("taken at configure")
     return "; ".join(words)
 
 
+def described(item: Field[Any]) -> str:
+    """Description and unit."""
+    return item.metadata["description"] + (f" [{item.metadata['unit']}]" if item.metadata["unit"] else "")
+
+
+def taken_at_configure(item: Field[Any]) -> bool:
+    """Whether the transition ``configure`` takes it; so does it with every setting of the library."""
+    return bool(item.metadata.get("at_configure", True))
+
+
 def descriptor(item: Field[Any]) -> ParameterDescriptor:
-    """The ROS descriptor of a dataclass field made with ``parameter``."""
-    data = item.metadata
-    unit = f" [{data['unit']}]" if data["unit"] else ""
+    """The ROS descriptor of a field."""
     result = ParameterDescriptor(
         name=item.name,
-        description=data["description"] + unit,
+        description=described(item),
         additional_constraints=constraints_text(item),
-        read_only=data["read_only"],
+        read_only=item.metadata.get("read_only", False),
     )
-    low, high = data["low"], data["high"]
-    if low is not None:
-        if isinstance(item.default, float):
-            span = FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
-            result.floating_point_range = [span]
-        else:
-            span = IntegerRange(from_value=int(low), to_value=int(high), step=0)
-            result.integer_range = [span]
+    low, high = item.metadata["low"], item.metadata["high"]
+    if low is not None and isinstance(item.default, float):
+        result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)]
+    elif low is not None:
+        result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
     return result
 
 
 def check_value(item: Field[Any], given: Parameter) -> None:
-    """Refuse a value that the field ``item`` cannot take.
+    """Refuse a value that the parameter ``item`` cannot take.
 
     Raises:
         InputError: Another type, out of range, not finite, too long or no valid choice.
@@ -131,20 +130,8 @@ def check_value(item: Field[Any], given: Parameter) -> None:
         raise InputError(item.name, f"{len(texts)} items", f"at most {LONGEST_LIST}")
     if any(len(text) > LONGEST_TEXT for text in texts):
         raise InputError(item.name, f"{max(map(len, texts))} characters", f"at most {LONGEST_TEXT}")
-    if data["choices"] and value not in data["choices"]:
+    if data.get("choices") and value not in data["choices"]:
         raise UnknownNameError(item.name, cut(value, 100), data["choices"])
-
-
-def check_names(given: Mapping[str, Parameter], valid: Sequence[str], declared: Sequence[str]) -> None:
-    """Refuse overrides with names that no parameter has; what ROS declares by itself is allowed.
-
-    Raises:
-        UnknownNameError: The first such name, with the closest valid one.
-    """
-    known = {*valid, *declared, *BUILT_IN}
-    for name in given:
-        if name not in known and not name.startswith(QOS):
-            raise UnknownNameError("parameter", cut(name, 100), sorted([*valid, "use_sim_time"]))
 
 
 class NodeParameters(Generic[P]):
@@ -155,17 +142,18 @@ class NodeParameters(Generic[P]):
         in_use: Whether the node is configured: then what is taken at configure cannot be changed.
 
     Raises:
-        InputError: A name given at start (file, command line, launch) is unknown, a value of another type or
-            out of range, or values do not fit together.
+        UnknownNameError: A name given at start (file, command line, launch) is unknown.
+        InputError: A value given at start is of another type or out of range, or values do not fit together.
     """
 
     def __init__(self, node: Node, defaults: P) -> None:
         self._items: dict[str, Field[Any]] = {f.name: f for f in fields(defaults)}  # type: ignore[arg-type]
         self.in_use = False
-        given: Mapping[str, Parameter] = node._parameter_overrides
-        check_names(given, list(self._items), list(node._parameters))
-        for name in given.keys() & self._items.keys():
-            check_value(self._items[name], given[name])
+        for name, given in given_parameters(node).items():
+            if name in self._items:
+                check_value(self._items[name], given)
+            elif not (name.startswith(QOS) or name in BUILT_IN or node.has_parameter(name)):
+                raise UnknownNameError("parameter", cut(name, 100), sorted([*self._items, "use_sim_time"]))
         values = {
             name: node.declare_parameter(name, getattr(defaults, name), descriptor(item)).value
             for name, item in self._items.items()
@@ -191,17 +179,16 @@ class NodeParameters(Generic[P]):
 
     def _check_change(self, item: Field[Any], change: Parameter) -> None:
         check_value(item, change)
-        if item.metadata["at_configure"] and self.in_use and self._own([change])[item.name] != self._now(item):
+        before, after = getattr(self.value, item.name), self._own([change])[item.name]
+        if self.in_use and taken_at_configure(item) and before != after:
             advice = "first the transitions deactivate and cleanup, then configure and activate"
             raise InputError(item.name, brief(change.value), "no change while the node is configured", advice)
-
-    def _now(self, item: Field[Any]) -> Any:
-        return getattr(self.value, item.name)
 
     def _follow(self, changes: list[Parameter]) -> None:
         self.value = replace(self.value, **self._own(changes))  # type: ignore[type-var]
 
     def _own(self, changes: list[Parameter]) -> dict[str, Any]:
+        """The changes of parameters declared here, by name."""
         return _plain({c.name: c.value for c in changes if c.name in self._items})
 
 

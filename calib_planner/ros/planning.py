@@ -1,7 +1,7 @@
-"""From a request on the wire to a plan or a refusal with its field: no node, no executor.
+"""From a request for a plan to a plan, or to a refusal that names the field: no node, no executor.
 
-The request is the service's or the action's (same fields). It comes from anyone, so the robot must be the
-node's own or a shipped one (never a path), and sizes are bounded.
+The request is the service's or the action's; their fields are the same. It comes from anyone, so the robot must
+be the node's own or a shipped one (never a path), and sizes are bounded.
 """
 
 from __future__ import annotations
@@ -20,40 +20,38 @@ from calib_planner.io import config_folder, read_constraints
 from calib_planner.planning import (
     Candidates,
     Constraint,
-    ModelDiscrepancy,
     Plan,
     PlanProblem,
     Progress,
     Search,
     plan,
+    usual_discrepancy,
 )
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import check_rows
 from calib_planner.ros.model import Model, NotReady, shipped_model
-from calib_planner.ros.settings import PlannerParameters, unknown_words
+from calib_planner.ros.settings import PlannerParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
 
 MOST_PARAMETERS = 1000
 SMALLEST_SIGMA = 1e-9
-"""As the node's parameter: far below any instrument, far above what overflows when squared."""
+"""As of the node's parameter [m]: far below any instrument, far above what underflows when squared."""
 MOST_COORDINATES = 3000
-"""Configurations times joints: the search keeps a square matrix of them (100 MB with its copies)."""
+"""Configurations times joints: the search holds a square matrix of that size (100 MB with its copies)."""
 FIELD_OF = {"weights": "test_pose_weights"}
-"""The request's word for a field of ``PlanProblem``, where they differ."""
-
-Callback = Callable[[Progress], bool | None]
+"""Field of ``PlanProblem`` → field of the request, where the names differ."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a request.
+    """The answer to a request.
 
     Attributes:
         status: Name of a status constant of PlanCalibration.
-        field: Request field at fault; empty if none.
+        field: Field of the request at fault; empty if none.
         message: The outcome and what to do.
         plan: The plan, if there is a usable one.
-        model: The robot it is for.
+        model: The robot that the plan is for.
     """
 
     status: str
@@ -67,28 +65,27 @@ def answer(
     request: Any,
     settings: PlannerParameters,
     own: Model | NotReady,
-    callback: Callback | None = None,
+    callback: Callable[[Progress], bool | None] | None = None,
 ) -> Answer:
-    """Plan what is asked; every fault of the request becomes an ``Answer``."""
+    """Make the plan of a request; every fault of the request becomes an ``Answer``."""
     try:
         model = _model(request, settings, own)
-        found = plan(problem_of(request, settings, model), callback)
+        made = plan(problem_of(request, settings, model), callback)
     except NotReady as error:
         return Answer("NOT_READY", "robot", cut(error))
     except InputError as error:
-        field = re.match(r"\w*", error.field)
-        name = field[0] if field else ""
+        name = error.field[: re.match(r"\w*", error.field).end()]  # type: ignore[union-attr]
         return Answer("INVALID_REQUEST", FIELD_OF.get(name, name), cut(error))
     except InfeasibleError as error:
         return Answer("INFEASIBLE", cut(error.constraint), cut(error))
-    if found.quality.status == "singular":
-        return Answer("INFEASIBLE", "configurations", found.quality.message)
-    status = "CANCELLED" if found.quality.status == "cancelled" else "SUCCESS"
-    return Answer(status, "", found.quality.message, found, model)
+    if made.quality.status == "singular":
+        return Answer("INFEASIBLE", "configurations", made.quality.message)
+    status = "CANCELLED" if made.quality.status == "cancelled" else "SUCCESS"
+    return Answer(status, "", made.quality.message, made, model)
 
 
 def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanProblem:
-    """The library's problem for a request; zero and empty fields take the node's defaults.
+    """The library's problem of a request; zero and empty fields take the node's defaults.
 
     Raises:
         InputError: A field is not usable.
@@ -113,7 +110,6 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         raise InputError("sigma", sigma, f"0 (the node's default), or {SMALLEST_SIGMA:g} to 1 m")
     criterion = request.criterion or settings.criterion
     candidates = _candidates(request, settings, robot)
-    real = model.described and candidates is not None and criterion == "test_pose"
     return PlanProblem(
         robot,
         poses,
@@ -123,14 +119,14 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         noise=sigma or settings.sigma,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        discrepancy=ModelDiscrepancy() if real else None,
+        discrepancy=usual_discrepancy(robot, criterion, candidates),
         search=Search(starts=settings.starts, seed=int(request.seed), time_limit=limit or settings.time_limit),
-        candidates=None if candidates is None else Candidates(candidates),
+        candidates=candidates,
     )
 
 
-def constraints_of(settings: PlannerParameters, robot: Robot) -> tuple[Constraint, ...]:
-    """Those of the file that the node's parameters name.
+def constraints_of(settings: PlanParameters, robot: Robot) -> tuple[Constraint, ...]:
+    """The constraints of the file that the node's parameters name.
 
     Raises:
         InputError: The name leaves the folder, or the file does not fit the robot.
@@ -143,7 +139,7 @@ def constraints_of(settings: PlannerParameters, robot: Robot) -> tuple[Constrain
 
 
 def file_in(folder: Path, name: str, field: str) -> Path:
-    """The file ``name`` directly in ``folder``; parameters may be set by anyone, and no path leads out of it.
+    """The file ``name`` in ``folder`` itself; anyone may set parameters, and no path leads out of the folder.
 
     Raises:
         InputError: Not the plain name of an existing file there.
@@ -155,24 +151,19 @@ def file_in(folder: Path, name: str, field: str) -> Path:
     return path
 
 
-def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> FloatArray | None:
+def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> Candidates | None:
     if not len(request.candidates):
         return None
     rows = check_rows("candidates", request.candidates, robot.joint_names)
     if len(rows) > settings.most_candidates:
         advice = "raise the node's parameter most_candidates if you mean it"
         raise InputError("candidates", f"{len(rows)} rows", f"at most {settings.most_candidates}", advice)
-    low, high = robot.joint_limits.T
-    outside = (rows < low - 1e-6) | (rows > high + 1e-6)
-    if outside.any():  # a robot may be sent there
-        i, j = (int(k) for k in np.argwhere(outside)[0])
-        expected = f"within the limits [{low[j]:.4f}, {high[j]:.4f}] of {robot.joint_names[j]}"
-        raise InputError(f"candidates[{i}]", f"{rows[i, j]:g}", expected)
-    return rows
+    robot.check_within_limits("candidates", rows)  # a robot may be sent there
+    return Candidates(rows)
 
 
 def _weights(request: Any) -> FloatArray | None:
-    """Relative to the largest, since only that matters and sums of huge ones overflow."""
+    """(t,) weights, divided by the largest, since only ratios matter and sums of huge weights overflow."""
     given = np.asarray(request.test_pose_weights, float)
     if not given.size:
         return None
@@ -181,13 +172,14 @@ def _weights(request: Any) -> FloatArray | None:
 
 
 def _model(request: Any, settings: PlannerParameters, own: Model | NotReady) -> Model:
+    """The robot of a request: the node's own, or the shipped one that it names."""
     names = list(request.parameters)
     if len(names) > MOST_PARAMETERS:
         raise InputError("parameters", f"{len(names)} names", f"at most {MOST_PARAMETERS}")
     wanted = names or settings.parameters
     if isinstance(own, Model) and request.robot in ("", own.robot.name):
         robot = own.robot.with_parameters(wanted, unknown_words(settings.unknown))
-        return Model(robot, own.speeds, own.described)
+        return Model(robot, own.speeds)
     if not request.robot and isinstance(own, NotReady):
         raise own
     return shipped_model(request.robot, wanted, settings.unknown)

@@ -38,7 +38,7 @@ from calib_planner.io import (
     write_measurements,
     write_text,
 )
-from calib_planner.measurements import Measurements
+from calib_planner.measurements import Measurements, RejectedPoint
 from calib_planner.planning import Plan
 from calib_planner.report import InputFile, Provenance, write_report
 from calib_planner.robot import Robot
@@ -314,14 +314,14 @@ class Campaign:
         What cannot be written now is written with the next: the data it follows from are there.
         """
         rejected = defaultdict(list)
-        for point in self.newest.rejected if isinstance(self.newest, Estimate) else ():
-            rejected[point["row"]].append(point)
+        for point in self.newest.points.rejected if isinstance(self.newest, Estimate) else ():
+            rejected[point.row].append(point)
         changed = []
         for row, before in enumerate(self.kept):
             own = rejected[row]
             if not own and before.status == ACCEPTED and not before.unused:
                 continue
-            unused = tuple(sorted(int(r["target"]) - 1 for r in own))
+            unused = tuple(sorted(r.target - 1 for r in own))
             seen = int((before.standstill.samples > 0).sum())
             status = OUTLIER if own and len(own) == seen else ACCEPTED
             if (status, unused) != (before.status, before.unused):
@@ -342,18 +342,18 @@ def condition_of(estimate: Estimate) -> float:
 
     The square root of that of their correlations: as for a Jacobian, 1 is best.
     """
-    variances = np.diag(estimate.covariance)
+    variances = np.diag(estimate.fit.covariance)
     found = np.isfinite(variances) & (variances > 0)
     if not found.any():
         return float("nan")
     scale = np.sqrt(variances[found])
-    values = np.linalg.eigvalsh(estimate.covariance[np.ix_(found, found)] / np.outer(scale, scale))
+    values = np.linalg.eigvalsh(estimate.fit.covariance[np.ix_(found, found)] / np.outer(scale, scale))
     return float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else float("inf")
 
 
-def _reasons(rejected: Iterable[dict[str, object]]) -> str:
+def _reasons(rejected: Iterable[RejectedPoint]) -> str:
     """Why points are not used, in words."""
-    return "; ".join(f"target {r['target']}: {r['reason']}" for r in rejected)
+    return "; ".join(f"target {r.target}: {r.reason}" for r in rejected)
 
 
 def _nearest_row(plan: Plan, distance: FloatArray, done: Counter[int | None], tolerance: float) -> int | None:

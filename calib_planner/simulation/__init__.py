@@ -1,6 +1,12 @@
 """The world we test in: a robot with hidden true parameters, a tracker with noise, and what goes wrong."""
 
-from calib_planner.simulation.cell import ANGLE_ERROR, LENGTH_ERROR, SimulatedCell, random_deviations
+from calib_planner.simulation.cell import (
+    ANGLE_ERROR,
+    LENGTH_ERROR,
+    SimulatedCell,
+    independent_seeds,
+    random_deviations,
+)
 from calib_planner.simulation.faults import Faults
 from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour, make_tour
 from calib_planner.simulation.streams import Message, Rates, Streams, play

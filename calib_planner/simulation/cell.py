@@ -21,6 +21,11 @@ ANGLE_ERROR = 1e-3
 """Default standard deviation of true angle errors [rad]."""
 
 
+def independent_seeds(seed: int, count: int) -> list[int]:
+    """``count`` seeds whose random numbers have nothing to do with each other, all from one."""
+    return [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
+
+
 def random_deviations(
     robot: Robot, seed: int, length: float = LENGTH_ERROR, angle: float = ANGLE_ERROR
 ) -> dict[str, float]:

@@ -9,23 +9,12 @@ and signs that no parameter gives are drawn from the seed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass
 
-from calib_planner.arrays import check_count, check_number
+from calib_planner.arrays import check_ranges, ranged
 from calib_planner.errors import InputError
 
 NEVER = -1
-
-
-def fault(default: float, description: str, unit: str, low: float, high: float) -> Any:
-    """A field with what a person and a parser must know of it; an int default makes it a whole number.
-
-    The metadata have the keys that node parameters have, so that a node inherits the faults as they are.
-    """
-    metadata = {"description": description, "unit": unit, "low": low, "high": high}
-    others = {"choices": (), "read_only": False, "at_configure": True}
-    return field(default=default, metadata=metadata | others)
 
 
 @dataclass(frozen=True)
@@ -72,48 +61,42 @@ class Faults:
     Both by a time uniform up to ``shuffle_delay``.
     """
 
-    transmission_error: float = fault(0.0, "joints turn beyond their reading, rms", "rad or m", 0.0, 0.1)
-    transmission_harmonics: int = fault(3, "waves per turn of the transmission error", "", 1, 200)
-    encoder_resolution: float = fault(0.0, "joint readings are multiples of this", "rad or m", 0.0, 0.1)
-    unsettled_probability: float = fault(0.0, "share of arrivals not settled", "", 0.0, 1.0)
-    oscillation: float = fault(1e-3, "swing of an arm not settled, at arrival", "m", 0.0, 0.1)
-    oscillation_frequency: float = fault(8.0, "frequency of that swing", "Hz", 0.01, 1000.0)
-    oscillation_decay: float = fault(0.3, "time constant of that swing", "s", 1e-3, 3600.0)
-    creep: float = fault(0.0, "slow creep of an arm not settled, at arrival", "m", 0.0, 0.1)
-    creep_time: float = fault(5.0, "time constant of that creep", "s", 1e-3, 3600.0)
-    reseat_at: int = fault(NEVER, "first arrival with the target seated elsewhere; -1 = never", "", NEVER, 10**6)
-    reseat_by: float = fault(3e-4, "how far the target then sits elsewhere, in the tip's frame", "m", 0.0, 0.1)
-    drift_translation: float = fault(0.0, "speed at which the station moves", "m/s", 0.0, 0.01)
-    drift_rotation: float = fault(0.0, "speed at which the station turns", "rad/s", 0.0, 0.01)
-    bump_at: int = fault(NEVER, "first arrival with the station pushed; -1 = never", "", NEVER, 10**6)
-    bump_translation: float = fault(3e-4, "how far the station is then moved", "m", 0.0, 0.1)
-    bump_rotation: float = fault(1e-4, "how far the station is then turned", "rad", 0.0, 0.1)
-    outlier_probability: float = fault(0.0, "share of single points far off", "", 0.0, 1.0)
-    outlier_standstills: float = fault(0.0, "share of arrivals with all points far off", "", 0.0, 1.0)
-    outlier_smallest: float = fault(0.01, "outliers: how far off, at least", "m", 0.0, 100.0)
-    outlier_largest: float = fault(0.05, "outliers: how far off, at most", "m", 0.0, 100.0)
-    beam_break_interval: float = fault(0.0, "mean time between beam breaks; 0 = none", "s", 0.0, 1e6)
-    beam_break_duration: float = fault(1.0, "length of a beam break", "s", 0.0, 3600.0)
-    relock_error: float = fault(0.0, "error of distances after a break, std", "m", 0.0, 0.1)
-    dropout_probability: float = fault(0.0, "share of tracker points never sent", "", 0.0, 1.0)
-    tracker_latency: float = fault(0.0, "tracker points arrive this late", "s", 0.0, 60.0)
-    tracker_jitter: float = fault(0.0, "mean of a further delay of tracker points", "s", 0.0, 60.0)
-    joint_latency: float = fault(0.0, "joint states arrive this late", "s", 0.0, 60.0)
-    joint_jitter: float = fault(0.0, "mean of a further delay of joint states", "s", 0.0, 60.0)
-    tracker_clock_offset: float = fault(0.0, "the tracker's clock is ahead of the robot's", "s", -3600.0, 3600.0)
-    tracker_clock_drift: float = fault(0.0, "how fast that clock gains on the robot's", "s/s", -0.01, 0.01)
-    duplicate_probability: float = fault(0.0, "share of messages that come twice", "", 0.0, 1.0)
-    reorder_probability: float = fault(0.0, "share of messages that come after later ones", "", 0.0, 1.0)
-    shuffle_delay: float = fault(0.05, "messages twice or held back: latest", "s", 0.0, 60.0)
+    transmission_error: float = ranged(0.0, "joints turn beyond their reading, rms", "rad or m", 0.0, 0.1)
+    transmission_harmonics: int = ranged(3, "waves per turn of the transmission error", "", 1, 200)
+    encoder_resolution: float = ranged(0.0, "joint readings are multiples of this", "rad or m", 0.0, 0.1)
+    unsettled_probability: float = ranged(0.0, "share of arrivals not settled", "", 0.0, 1.0)
+    oscillation: float = ranged(1e-3, "swing of an arm not settled, at arrival", "m", 0.0, 0.1)
+    oscillation_frequency: float = ranged(8.0, "frequency of that swing", "Hz", 0.01, 1000.0)
+    oscillation_decay: float = ranged(0.3, "time constant of that swing", "s", 1e-3, 3600.0)
+    creep: float = ranged(0.0, "slow creep of an arm not settled, at arrival", "m", 0.0, 0.1)
+    creep_time: float = ranged(5.0, "time constant of that creep", "s", 1e-3, 3600.0)
+    reseat_at: int = ranged(NEVER, "first arrival with the target seated elsewhere; -1 = never", "", NEVER, 10**6)
+    reseat_by: float = ranged(3e-4, "how far the target then sits elsewhere, in the tip's frame", "m", 0.0, 0.1)
+    drift_translation: float = ranged(0.0, "speed at which the station moves", "m/s", 0.0, 0.01)
+    drift_rotation: float = ranged(0.0, "speed at which the station turns", "rad/s", 0.0, 0.01)
+    bump_at: int = ranged(NEVER, "first arrival with the station pushed; -1 = never", "", NEVER, 10**6)
+    bump_translation: float = ranged(3e-4, "how far the station is then moved", "m", 0.0, 0.1)
+    bump_rotation: float = ranged(1e-4, "how far the station is then turned", "rad", 0.0, 0.1)
+    outlier_probability: float = ranged(0.0, "share of single points far off", "", 0.0, 1.0)
+    outlier_standstills: float = ranged(0.0, "share of arrivals with all points far off", "", 0.0, 1.0)
+    outlier_smallest: float = ranged(0.01, "outliers: how far off, at least", "m", 0.0, 100.0)
+    outlier_largest: float = ranged(0.05, "outliers: how far off, at most", "m", 0.0, 100.0)
+    beam_break_interval: float = ranged(0.0, "mean time between beam breaks; 0 = none", "s", 0.0, 1e6)
+    beam_break_duration: float = ranged(1.0, "length of a beam break", "s", 0.0, 3600.0)
+    relock_error: float = ranged(0.0, "error of distances after a break, std", "m", 0.0, 0.1)
+    dropout_probability: float = ranged(0.0, "share of tracker points never sent", "", 0.0, 1.0)
+    tracker_latency: float = ranged(0.0, "tracker points arrive this late", "s", 0.0, 60.0)
+    tracker_jitter: float = ranged(0.0, "mean of a further delay of tracker points", "s", 0.0, 60.0)
+    joint_latency: float = ranged(0.0, "joint states arrive this late", "s", 0.0, 60.0)
+    joint_jitter: float = ranged(0.0, "mean of a further delay of joint states", "s", 0.0, 60.0)
+    tracker_clock_offset: float = ranged(0.0, "the tracker's clock is ahead of the robot's", "s", -3600.0, 3600.0)
+    tracker_clock_drift: float = ranged(0.0, "how fast that clock gains on the robot's", "s/s", -0.01, 0.01)
+    duplicate_probability: float = ranged(0.0, "share of messages that come twice", "", 0.0, 1.0)
+    reorder_probability: float = ranged(0.0, "share of messages that come after later ones", "", 0.0, 1.0)
+    shuffle_delay: float = ranged(0.05, "messages twice or held back: latest", "s", 0.0, 60.0)
 
     def __post_init__(self) -> None:
-        for f in fields(Faults):
-            low, high, unit = (f.metadata[k] for k in ("low", "high", "unit"))
-            if isinstance(f.default, int):
-                check_count(f.name, getattr(self, f.name), low=low, high=high)
-            else:
-                value = check_number(f.name, getattr(self, f.name), low=low, high=high, unit=unit)
-                object.__setattr__(self, f.name, value)
+        check_ranges(self, Faults)
         if self.outlier_smallest > self.outlier_largest:
             expected = f"at most outlier_largest = {self.outlier_largest:g} m"
             raise InputError("outlier_smallest", self.outlier_smallest, expected)

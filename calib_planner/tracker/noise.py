@@ -106,5 +106,5 @@ class LaserTracker:
 def covariance_gradient(noise: Noise, points: FloatArray) -> FloatArray:
     """∂Σ/∂p, shape (…, 3, 3, 3) with the coordinate of p last, by complex steps: exact to rounding."""
     step = 1e-30
-    parts = [noise.covariance(points + 1j * step * unit).imag / step for unit in np.eye(3)]
-    return np.stack(parts, axis=-1)
+    moved = points[..., None, :] + 1j * step * np.eye(3)
+    return np.moveaxis(noise.covariance(moved).imag / step, -3, -1)

@@ -1,1 +1,4 @@
-"""The paper's tables and figures, computed again: data first, drawing and page second."""
+"""The paper's tables and figures, computed again: settings → ``reproduce`` → numbers → ``publish`` → files.
+
+The package uses calib_planner through its doors only; ``calib-planner reproduce`` is its command.
+"""

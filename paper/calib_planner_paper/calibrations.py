@@ -78,7 +78,7 @@ class Calibrations:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers [m, rad]."""
-        found: dict[str, Any] = plain(
+        values: dict[str, Any] = plain(
             {
                 "plan": self.label,
                 "configurations": self.configurations,
@@ -89,7 +89,7 @@ class Calibrations:
                 "errors": self.errors,
             }
         )
-        return found
+        return values
 
 
 def calibrate(
@@ -107,8 +107,8 @@ def calibrate(
     errors = np.empty((laboratory.count, 3))
     for row, seed in enumerate(seeds):
         data = cell.measure(configurations, repetitions, int(seed))
-        found = identify(IdentificationProblem(robot, data, sigma, **PLAIN))
-        errors[row] = found.calibrated.positions(pose)[0, 0] - truth
+        estimate = identify(IdentificationProblem(robot, data, sigma, **PLAIN))
+        errors[row] = estimate.calibrated.positions(pose)[0, 0] - truth
     spread = error_covariance(robot, configurations, repetitions, pose, sigma)
     mean = float(np.trace(spread))
     relative = 0.5 * np.sqrt(2 * np.trace(spread @ spread) / laboratory.count) / mean

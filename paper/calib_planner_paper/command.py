@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from functools import partial
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from calib_planner.cli import Commands, Terminal, add_command, add_seed
+from calib_planner.io import make_folder
 from calib_planner_paper import printed
-from calib_planner_paper.page import micrometres
+from calib_planner_paper.page import micrometres, publish
 from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, reproduce
 
 DESCRIPTION = """Compute Tables 1 and 2 and Figs 2, 3 and 5 of the paper again, beside what it prints.
@@ -21,39 +21,21 @@ page, index.html, that says what agrees and what cannot be compared. Shown in µ
 
 def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
-    usual = ReproductionSettings()
-    parser = add_command(
-        commands,
-        "reproduce",
-        summary,
-        run,
-        "calib-planner reproduce --output results/paper",
-        DESCRIPTION,
-    )
+    usual, example = ReproductionSettings(), "calib-planner reproduce --output results/paper"
+    parser = add_command(commands, "reproduce", summary, run, example, DESCRIPTION)
     parser.add_argument(
         "--output", default="results/paper", metavar="DIR", help="folder for the files (results/paper)"
     )
-    parser.add_argument(
-        "--random",
-        type=int,
-        default=usual.random_plans,
-        metavar="N",
-        help=f"random plans per column of Table 2 ({usual.random_plans})",
-    )
-    parser.add_argument(
-        "--calibrations",
-        type=int,
-        default=usual.calibrations,
-        metavar="N",
-        help=f"simulated calibrations per plan of the figures ({usual.calibrations})",
-    )
+    for name, value, text in (
+        ("--random", usual.random_plans, "random plans per column of Table 2"),
+        ("--calibrations", usual.calibrations, "simulated calibrations per plan of the figures"),
+    ):
+        parser.add_argument(name, type=int, default=value, metavar="N", help=f"{text} ({value})")
     add_seed(parser)
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work."""
-    from calib_planner_paper.page import make_folder, publish  # matplotlib is slow to import
-
     settings = ReproductionSettings(args.random, args.calibrations, args.seed)
     folder = make_folder(args.output)  # before the work, not after it
     with terminal.progress("reproducing the paper") as update:
@@ -85,7 +67,7 @@ def _table_1(result: Reproduction) -> Table:
     table = Table(title="Table 1: ρ0²/σ² of two measurements, by q20")
     table.add_column("")
     for c in columns:
-        table.add_column(f"{np.degrees(c.q20):.0f}°", justify="right")
+        table.add_column(c.angle, justify="right")
     table.add_row("paper", *(f"{c.printed:g}{' ✗' if c.misprinted else ''}" for c in columns))
     table.add_row("by (20)", *(f"{c.closed_form:.3f}" for c in columns))
     table.add_row("planned", *(f"{c.planned:.3f}" for c in columns))
@@ -98,8 +80,8 @@ def _table_2(result: Reproduction) -> Table:
     table = Table(title="Table 2: ρ0 at the test pose [µm], by number of experiments")
     table.add_column("")
     table.add_column("")
-    for m, r in printed.SIZES:
-        table.add_column(str(m) if r == 1 else f"{m}×{r}", justify="right")
+    for label in printed.LABELS:
+        table.add_column(label, justify="right")
     for row, values in result.table_2[0].rows().items():
         if row in printed.TABLE_2:
             table.add_row(row, "paper", *map(micrometres, printed.TABLE_2[row]))

@@ -1,4 +1,4 @@
-"""Table 2: random plans and proposed plans for the KUKA KR 270, with the bound that no plan can beat.
+"""The KUKA KR 270 of section 6: Table 2, random and proposed plans with their bound, and Fig. 5, calibrations.
 
 The paper gives neither test pose nor link lengths nor workspace, so three test poses and a workspace are chosen
 here; the first test pose is the table's, the others show what depends on that choice.
@@ -8,7 +8,11 @@ and so it divides the best plan's, the bound, and every statistic of the same ra
 
 With three configurations there are just nine equations for nine parameters. det J changes sign within the
 workspace, and near where it does ρ0 grows like 1/|det J|: the share of random plans worse than t falls only like
-1/t, which has no mean. Maximum and mean of that column tell the luck of the draw; its median can be compared.
+1/t, which has no mean. Maximum and mean of that column depend on chance; its median can be compared.
+
+Every plan of Fig. 5 has 12 measurements: 12 random configurations, three proposed ones measured four times, four
+measured three times, and twelve. The random plan is the one with the median ρ0 of a hundred and one, so that
+chance did not favour it.
 """
 
 from __future__ import annotations
@@ -32,6 +36,17 @@ WORKSPACE = WorkspaceBox([0.6, -1.5, 0.2], [2.6, 1.5, 2.4])
 """In front of the robot, in its base frame [m]; the reflector is at the flange."""
 SEPARATE = tuple(m for m, r in printed.SIZES if r == 1)
 """Numbers of configurations that have to be computed."""
+
+SUMMARY = (
+    "configurations",
+    "predicted_accuracy",
+    "lower_bound",
+    "efficiency",
+    "bound",
+    "general_accuracy",
+    "status",
+)
+"""What ``tables.json`` holds of a plan."""
 
 Rows = Mapping[str, tuple[float, ...]]
 """Row of the table → values by column of ``printed.SIZES``."""
@@ -105,7 +120,7 @@ class Table2:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers [m, rad]; what is not finite becomes ``None``."""
-        found: dict[str, Any] = plain(
+        values: dict[str, Any] = plain(
             {
                 "test_pose": self.pose.configuration,
                 "why": self.pose.why,
@@ -113,10 +128,10 @@ class Table2:
                 "rows": self.rows(),
                 "scaled": self.scaled(),
                 "tail": {str(m): self.tail(m) for m in SEPARATE},
-                "plans": {str(m): _summary(found) for m, found in self.plans.items()},
+                "plans": {str(m): {key: one.values()[key] for key in SUMMARY} for m, one in self.plans.items()},
             }
         )
-        return found
+        return values
 
 
 def scaled(rows: Rows) -> Rows:
@@ -138,7 +153,7 @@ def table_2(pose: ChosenPose, random_plans: int, seed: int) -> Table2:
 
 
 def kuka_problem(pose: ChosenPose, configurations: int, repetitions: int = 1, *, seed: int) -> PlanProblem:
-    """What is asked of the planner for one column."""
+    """The planner's problem for one column."""
     return PlanProblem(
         Robot.load(ROBOT),
         pose.configuration,
@@ -150,21 +165,7 @@ def kuka_problem(pose: ChosenPose, configurations: int, repetitions: int = 1, *,
     )
 
 
-def _summary(found: Plan) -> dict[str, Any]:
-    return {
-        "configurations": found.configurations,
-        "predicted_accuracy": found.quality.predicted_accuracy,
-        "lower_bound": found.quality.lower_bound,
-        "efficiency": found.quality.efficiency,
-        "bound": found.quality.bound,
-        "general_accuracy": found.quality.general_accuracy,
-        "status": found.quality.status,
-    }
-
-
-# ── Fig. 5: simulated calibrations of the KUKA KR 270 with a random plan and with three proposed ones ───────
-# Every plan has 12 measurements: 12 random configurations, three proposed ones measured four times, four measured
-# three times, and twelve. The random plan is the median one of a hundred and one, so that its luck is ordinary.
+# ── Fig. 5 ───────────────────────────────────────────────────────────────────────────────────────────
 
 MEASUREMENTS = 12
 DRAWN = 101
@@ -198,12 +199,10 @@ def figure_5(table: Table2, count: int, seed: int) -> Figure5:
     problem = kuka_problem(table.pose, MEASUREMENTS, seed=seed)
     laboratory = Laboratory(problem.robot, table.pose.configuration, SIGMA, count, seed)
     work = [("random", ordinary_plan(table, seed), 1)]
-    for m, r in printed.SIZES:
+    for (m, r), label in zip(printed.SIZES, printed.LABELS, strict=True):
         if m * r == MEASUREMENTS:
-            work.append((str(m) if r == 1 else f"{m}×{r}", table.plans[m].configurations, r))
-    return Figure5(
-        tuple(calibrate(laboratory, label, q, r, 50 + k) for k, (label, q, r) in enumerate(work)),
-    )
+            work.append((label, table.plans[m].configurations, r))
+    return Figure5(tuple(calibrate(laboratory, label, q, r, 50 + k) for k, (label, q, r) in enumerate(work)))
 
 
 def ordinary_plan(table: Table2, seed: int) -> FloatArray:
@@ -212,5 +211,5 @@ def ordinary_plan(table: Table2, seed: int) -> FloatArray:
     rng = np.random.default_rng([seed, 5])
     drawn = plan_space(problem).feasibility.sample(rng, DRAWN * MEASUREMENTS).reshape(DRAWN, MEASUREMENTS, -1)
     pose = table.pose.configuration
-    worth = [np.trace(error_covariance(problem.robot, q, 1, pose, SIGMA)) for q in drawn]
-    return np.asarray(drawn[int(np.argsort(worth)[DRAWN // 2])])
+    variances = [np.trace(error_covariance(problem.robot, q, 1, pose, SIGMA)) for q in drawn]
+    return np.asarray(drawn[int(np.argsort(variances)[DRAWN // 2])])

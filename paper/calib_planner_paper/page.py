@@ -1,20 +1,23 @@
-"""HTML pieces of the page: tables, lists, pictures inside the page. Text is escaped here and nowhere else."""
+"""The files of a reproduction: ``tables.json``, figures as PNG and SVG, and the page ``index.html``.
+
+The page shows the paper's numbers beside those computed here, and says what agrees and what cannot be compared.
+Its words are in the template ``reproduction.html``; every number comes from the result, whatever its seed.
+"""
 
 from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from html import escape
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from string import Template
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib_planner import __version__
 from calib_planner.errors import InputError
-from calib_planner.io import write_text
+from calib_planner.io import make_folder, write_text
+from calib_planner.report import render
 from calib_planner.units import signed
 from calib_planner_paper import printed
 from calib_planner_paper.drawing import draw_figure_5, draw_two_link_figure, png, svg
@@ -22,67 +25,70 @@ from calib_planner_paper.kuka import DRAWN, SEPARATE, SIGMA, WORKSPACE, Figure5,
 from calib_planner_paper.reproduce import Reproduction
 from calib_planner_paper.two_link import Table1, TwoLinkFigure
 
+TEMPLATE = Path(__file__).parent / "reproduction.html"
+PLANS = {"a": "a, poor", "b": "b, D-optimal", "c": "c, for the test pose"}
 
-@dataclass(frozen=True)
-class Cell:
-    """A cell that is more than text.
 
-    Attributes:
-        text: What it says.
-        kind: Class: ``wrong`` for a printed value that contradicts the paper itself, ``words`` for prose.
+def publish(result: Reproduction, folder: str | Path) -> None:
+    """Write all files to ``folder``, made if need be. Same result, same bytes.
+
+    Raises:
+        InputError: The folder cannot be made or written.
     """
+    target = make_folder(folder)
+    drawn = {
+        "figure_2": [draw_two_link_figure(result.figure_2, narrow=n) for n in (False, True)],
+        "figure_3": [draw_two_link_figure(result.figure_3, narrow=n) for n in (False, True)],
+        "figure_5": [draw_figure_5(result.figure_5, narrow=n) for n in (False, True)],
+    }
+    pictures = {name: (svg(wide), svg(narrow)) for name, (wide, narrow) in drawn.items()}
+    for name, (wide, _) in drawn.items():
+        try:
+            (target / f"{name}.svg").write_bytes(pictures[name][0])
+            (target / f"{name}.png").write_bytes(png(wide))
+        except OSError as error:
+            got = f"{target} ({error.strerror or error})"
+            raise InputError("output", got, "a folder that can be written", "choose another") from None
+    text = json.dumps(result.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
+    write_text(target / "tables.json", text + "\n")
+    write_text(target / "index.html", page(result, pictures))
 
-    text: str
-    kind: str
+
+def page(result: Reproduction, pictures: dict[str, tuple[bytes, bytes]]) -> str:
+    """The page as HTML text; ``pictures``: figure → SVG for wide screens and paper, SVG for phones."""
+    images = {
+        name: [f"data:image/svg+xml;base64,{b64encode(image).decode()}" for image in pair]
+        for name, pair in pictures.items()
+    }
+    return render(
+        TEMPLATE,
+        version=__version__,
+        settings=result.settings,
+        random=f"{result.settings.random_plans:,}".replace(",", " "),
+        images=images,
+        drawn=DRAWN,
+        columns=result.table_1.columns,
+        table_1=_table_1(result.table_1),
+        two_link={2: _two_link(result.figure_2), 3: _two_link(result.figure_3)},
+        **_table_2(result.table_2),
+        **_figure_5(result.figure_5),
+    )
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of a table.
+class Table(NamedTuple):
+    """A table: caption, names of the columns, rows of texts."""
 
-    Attributes:
-        cells: Text, left to right.
-        ours: Whether the numbers were computed here; such rows stand out.
-    """
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Row]
 
-    cells: Sequence[str | Cell]
+
+class Row(NamedTuple):
+    """Texts, left to right; ``ours``: computed here; ``wrong``: columns that contradict the rest of the print."""
+
+    cells: Sequence[str]
     ours: bool = False
-
-
-def table(caption: str, header: Sequence[str], rows: Iterable[Row]) -> str:
-    """A table that scrolls by itself on a narrow screen."""
-    head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    body = "\n".join(_row(row) for row in rows)
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return (
-        f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
-    )
-
-
-def _row(row: Row) -> str:
-    kind = ' class="ours"' if row.ours else ""
-    return f"<tr{kind}>{''.join(_cell(c) for c in row.cells)}</tr>"
-
-
-def _cell(cell: str | Cell) -> str:
-    if isinstance(cell, str):
-        return f"<td>{escape(cell)}</td>"
-    return f'<td class="{cell.kind}">{escape(cell.text)}</td>'
-
-
-def listed(items: Iterable[str]) -> str:
-    """Bullets."""
-    return f"<ul>{''.join(f'<li>{escape(i)}</li>' for i in items)}</ul>"
-
-
-def picture(wide: bytes, narrow: bytes, described: str) -> str:
-    """SVG images inside the page: one for wide screens and paper, one for phones; the text describes both."""
-    sources = [f"data:image/svg+xml;base64,{b64encode(image).decode()}" for image in (narrow, wide)]
-    text = escape(described)
-    return (
-        f'<figure><picture><source media="screen and (max-width: 620px)" srcset="{sources[0]}">'
-        f'<img src="{sources[1]}" alt="{text}"></picture><figcaption>{text}</figcaption></figure>'
-    )
+    wrong: Sequence[int] = ()
 
 
 def micrometres(metres: float) -> str:
@@ -103,86 +109,27 @@ def number(value: float) -> str:
     return f"{float(digits):g}·10{superscript}"
 
 
-# ── The page: the paper's numbers beside those computed here, and in words what agrees and what cannot be com
-# The words are in the template; every number in them comes from the result, whatever its seed.
-
-TEMPLATE = Path(__file__).parent / "reproduction.html"
-PLANS = {"a": "a, poor", "b": "b, D-optimal", "c": "c, for the test pose"}
-
-Pictures = Mapping[str, tuple[bytes, bytes]]
-"""Figure → SVG for wide screens and paper, SVG for phones."""
+# ── the two-link arm ─────────────────────────────────────────────────────────────────────────────────
 
 
-def page(result: Reproduction, pictures: Pictures) -> str:
-    """The page as HTML text."""
-    settings = result.settings
-    values = {
-        "version": __version__,
-        "seed": str(settings.seed),
-        "random": f"{settings.random_plans:,}".replace(",", " "),
-        "calibrations": str(settings.calibrations),
-        **_table_1_values(result.table_1),
-        **_two_link_values(result.figure_2, pictures["figure_2"]),
-        **_two_link_values(result.figure_3, pictures["figure_3"]),
-        **table_2_values(result.table_2),
-        **figure_5_values(result.figure_5, pictures["figure_5"]),
-    }
-    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(values)
-
-
-# ── Table 1 ──────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _table_1_values(result: Table1) -> dict[str, str]:
+def _table_1(result: Table1) -> Table:
     columns = result.columns
-    angles = [f"{np.degrees(c.q20):.0f}°" for c in columns]
-    wrong = [(angle, c) for angle, c in zip(angles, columns, strict=True) if c.misprinted]
-
-    def printed(texts: list[str]) -> list[str | Cell]:
-        return [Cell(t, "wrong") if c.misprinted else t for t, c in zip(texts, columns, strict=True)]
-
+    wrong = [i for i, c in enumerate(columns, 1) if c.misprinted]
     rows = [
-        Row(("ρ0²/σ², paper", *printed([f"{c.printed:g}" for c in columns]))),
-        Row(("by (20)", *(f"{c.closed_form:.3f}" for c in columns)), True),
-        Row(("planner's plan, (14)", *(f"{c.planned:.3f}" for c in columns)), True),
-        Row(("lower bound", *(f"{c.lower_bound:.3f}" for c in columns)), True),
-        Row(("ρD²/σ², D-optimal plan", *(f"{c.d_optimal:.3f}" for c in columns)), True),
-        Row(("ρD/ρ0 − 1, paper", *printed([f"{100 * c.printed_gain:.0f} %" for c in columns]))),
-        Row(("ρD/ρ0 − 1, here", *(f"{100 * c.gain:.1f} %" for c in columns)), True),
+        Row(("ρ0²/σ², paper", *(f"{c.printed:g}" for c in columns)), wrong=wrong),
+        Row(("by (20)", *(f"{c.closed_form:.3f}" for c in columns)), ours=True),
+        Row(("planner's plan, (14)", *(f"{c.planned:.3f}" for c in columns)), ours=True),
+        Row(("lower bound", *(f"{c.lower_bound:.3f}" for c in columns)), ours=True),
+        Row(("ρD²/σ², D-optimal plan", *(f"{c.d_optimal:.3f}" for c in columns)), ours=True),
+        Row(("ρD/ρ0 − 1, paper", *(f"{100 * c.printed_gain:.0f} %" for c in columns)), wrong=wrong),
+        Row(("ρD/ρ0 − 1, here", *(f"{100 * c.gain:.1f} %" for c in columns)), ours=True),
     ]
-    return {
-        "table_1": table("", ("q20", *angles), rows),
-        "right": str(len(columns) - len(wrong)),
-        "wrong": " and ".join(angle for angle, _ in wrong),
-        "printed_wrong": f"{wrong[0][1].printed:g}",
-        "exact_wrong": f"{wrong[0][1].closed_form:.3f}",
-        "bound_1": " and ".join(sorted({c.bound for c in columns})),
-    }
+    return Table("", ("q20", *(c.angle for c in columns)), rows)
 
 
-# ── Figs 2 and 3 ─────────────────────────────────────────────────────────────────────────────────────
-
-
-def _two_link_values(result: TwoLinkFigure, pictures: tuple[bytes, bytes]) -> dict[str, str]:
-    n, gains = result.settings.number, result.gains()
-    caption = (
-        f"Errors left at the test pose (−45°, 20°) by {len(result.plans[0].errors)} simulated calibrations "
-        "per plan; σ = 1 mm."
-    )
-    return {
-        f"figure_{n}": picture(*pictures, caption),
-        f"plans_{n}": _plans(result),
-        f"gains_{n}": _gains(result),
-        f"gain_{n}a": f"{100 * gains[0].expected:.1f}",
-        f"gain_{n}b": f"{100 * gains[1].expected:.1f}",
-        f"planned_{n}": f"{1e3 * result.planned:.3f}",
-        f"bound_{n}": f"{1e3 * result.lower_bound:.3f}",
-        f"c_{n}": f"{1e3 * result.plans[2].expected:.3f}",
-    }
-
-
-def _plans(result: TwoLinkFigure) -> str:
-    rows = [
+def _two_link(result: TwoLinkFigure) -> dict[str, Any]:
+    """What the template shows of Fig. 2 or 3."""
+    plans = [
         Row(
             (
                 PLANS[p.label],
@@ -190,15 +137,11 @@ def _plans(result: TwoLinkFigure) -> str:
                 f"{1e3 * p.expected:.3f}",
                 f"{1e3 * p.simulated:.3f} ± {1e3 * p.standard_error:.3f}",
             ),
-            True,
+            ours=True,
         )
         for p, angles in zip(result.plans, result.settings.angles, strict=True)
     ]
-    return table("ρ0 [mm]; q1 = 0; ± standard error", ("plan", "q2", "by (14)", "simulated"), rows)
-
-
-def _gains(result: TwoLinkFigure) -> str:
-    rows = [
+    gains = [
         Row(
             (
                 f"c over {g.over}",
@@ -209,56 +152,59 @@ def _gains(result: TwoLinkFigure) -> str:
         )
         for g in result.gains()
     ]
-    return table("Gain 1 − ρc/ρ", ("", "paper", "by (14)", "simulated"), rows)
+    return {
+        "plans": Table("ρ0 [mm]; q1 = 0; ± standard error", ("plan", "q2", "by (14)", "simulated"), plans),
+        "gains": Table("Gain 1 − ρc/ρ", ("", "paper", "by (14)", "simulated"), gains),
+        "gain": [f"{100 * g.expected:.1f}" for g in result.gains()],
+        "planned": f"{1e3 * result.planned:.3f}",
+        "bound": f"{1e3 * result.lower_bound:.3f}",
+        "c": f"{1e3 * result.plans[2].expected:.3f}",
+    }
 
 
-# ── The page's tables and numbers on the KUKA KR 270: Table 2 and Fig. 5 ────────────────────────────────────
-
-LABELS = tuple(str(m) if r == 1 else f"{m}×{r}" for m, r in printed.SIZES)
-ONE_FOUR, FEW, FOUR, TWELVE = (LABELS.index(label) for label in ("4", "3×4", "4×3", "12"))
+# ── the KUKA KR 270 ──────────────────────────────────────────────────────────────────────────────────
 
 
-# ── Table 2 ──────────────────────────────────────────────────────────────────────────────────────────
-
-
-def table_2_values(tables: Sequence[Table2]) -> dict[str, str]:
-    """Template values: choices, tables, words."""
-    first = tables[0]
+def _table_2(tables: Sequence[Table2]) -> dict[str, Any]:
+    """What the template shows of Table 2: choices, tables, numbers in the text."""
+    first, unmeasurable = tables[0], tables[-1]
+    rows, twelve = first.rows(), printed.LABELS.index("12")
     box = zip("xyz", np.asarray(WORKSPACE.low), np.asarray(WORKSPACE.high), strict=True)
-    poses = [f"{t.pose.name}: ({_angles(t)}), {t.pose.why}" for t in tables]
-    bounds = {plan.quality.bound for one in tables for plan in one.plans.values()}
+    paper, here = (micrometres(r["proposed"][twelve]) for r in (printed.TABLE_2, rows))
+    title = f"The same over each one's own proposed plan of 12 (paper {paper} µm, here {here} µm)"
+    shown = ("random, mean", "random, median", "proposed", "lower bound")
+    poses = [(t.pose.name, ", ".join(f"{signed(a, 0)}°" for a in t.pose.degrees), t.pose.why) for t in tables]
+    others = [
+        Row((name, t.pose.name, *map(micrometres, t.rows()[name])), ours=True)
+        for t in tables[1:]
+        for name in shown
+    ]
+    header = ("", "", *printed.LABELS)
     return {
         "workspace": ", ".join(f"{n} {signed(a, 1)} … {signed(b, 1)} m" for n, a, b in box),
-        "poses": listed(poses),
-        "bound_kuka": " or ".join(sorted(bounds)),
-        **_tables(tables),
-        **_agreement(first, tables[-1]),
+        "poses": poses,
+        "bounds_kuka": sorted({plan.quality.bound for one in tables for plan in one.plans.values()}),
+        "tables_2": [
+            Table("ρ0 [µm] at test pose A, by number of experiments", header,
+                  _pairs(printed.TABLE_2, rows, micrometres)),
+            Table(title, header, _pairs(scaled(printed.TABLE_2), scaled(rows), number)),
+            Table("Other test poses, ρ0 [µm]", header, others),
+        ],
+        "normalised": [
+            ", ".join(f"{_normalised(row, m):.2f}" for m in SEPARATE)
+            for row in (rows["proposed"], printed.TABLE_2["proposed"])
+        ],
+        "here": _compared(scaled(rows)),
+        "paper": _compared(scaled(printed.TABLE_2)),
+        "at_c": _compared(unmeasurable.scaled()),
         "at_pose": micrometres(SIGMA * (3 / 12) ** 0.5),
         "spread": ", ".join(f"{_normalised(t.rows()['proposed'], 12):.2f} ({t.pose.name})" for t in tables),
-        "tail_3": f"{first.tail(3):.1f}",
-        "tail_4": f"{first.tail(4):.1f}",
-        "tail_12": f"{first.tail(12):.1f}",
+        "tail": {m: f"{first.tail(m):.1f}" for m in SEPARATE},
         "elsewhere": ", ".join(micrometres(first.plans[m].quality.general_accuracy) for m in SEPARATE),
-        "contradictions": "\n".join(_contradictions()),
-    }
-
-
-def _angles(found: Table2) -> str:
-    return ", ".join(f"{signed(a, 0)}°" for a in found.pose.degrees)
-
-
-def _tables(tables: Sequence[Table2]) -> dict[str, str]:
-    rows = tables[0].rows()
-    paper, here = (micrometres(r["proposed"][TWELVE]) for r in (printed.TABLE_2, rows))
-    header = ("", "", *LABELS)
-    title = f"The same over each one's own proposed plan of 12 (paper {paper} µm, here {here} µm)"
-    return {
-        "micrometres": table(
-            "ρ0 [µm] at test pose A, by number of experiments", header, _pairs(printed.TABLE_2, rows, micrometres)
-        ),
-        "scaled": table(title, header, _pairs(scaled(printed.TABLE_2), scaled(rows), number)),
-        "others": table("Other test poses, ρ0 [µm]", header, _others(tables[1:])),
-    }
+        "contradictions": [
+            (d.row, d.column, micrometres(d.printed), micrometres(d.implied)) for d in printed.contradictions()
+        ],
+    }  # fmt: skip
 
 
 def _pairs(paper: Rows, here: Rows, write: Callable[[float], str]) -> list[Row]:
@@ -267,36 +213,10 @@ def _pairs(paper: Rows, here: Rows, write: Callable[[float], str]) -> list[Row]:
     rows = []
     for name, values in here.items():
         if name in paper:
-            pairs = zip(LABELS, map(write, paper[name]), strict=True)
-            cells = [Cell(text, "wrong") if (name, label) in wrong else text for label, text in pairs]
-            rows.append(Row((name, "paper", *cells)))
-        rows.append(Row(("" if name in paper else name, "here", *map(write, values)), True))
+            columns = [i for i, label in enumerate(printed.LABELS, 2) if (name, label) in wrong]
+            rows.append(Row((name, "paper", *map(write, paper[name])), wrong=columns))
+        rows.append(Row(("" if name in paper else name, "here", *map(write, values)), ours=True))
     return rows
-
-
-def _others(tables: Sequence[Table2]) -> list[Row]:
-    shown = ("random, mean", "random, median", "proposed", "lower bound")
-    return [
-        Row((name, one.pose.name, *map(micrometres, one.rows()[name])), True) for one in tables for name in shown
-    ]
-
-
-def _agreement(first: Table2, unmeasurable: Table2) -> dict[str, str]:
-    """The figures behind "what agrees", here and in the paper."""
-    other = unmeasurable.scaled()["proposed"]
-    values = {
-        "own": _numbers([_normalised(first.rows()["proposed"], m) for m in SEPARATE]),
-        "theirs": _numbers([_normalised(printed.TABLE_2["proposed"], m) for m in SEPARATE]),
-        "few_c": signed(100 * (other[FEW] - 1), 1),
-        "four_c": signed(100 * (other[FOUR] - 1), 1),
-    }
-    for end, rows in (("", first.scaled()), ("_paper", scaled(printed.TABLE_2))):
-        values["few" + end] = signed(100 * (rows["proposed"][FEW] - 1), 1)
-        values["four" + end] = signed(100 * (rows["proposed"][FOUR] - 1), 1)
-        values["min_12" + end] = number(rows["random, min"][TWELVE])
-        values["mean_12" + end] = number(rows["random, mean"][TWELVE])
-        values["mean_4" + end] = f"{rows['random, mean'][ONE_FOUR] / rows['proposed'][ONE_FOUR]:.1f}"
-    return values
 
 
 def _normalised(row: tuple[float, ...], m: int) -> float:
@@ -304,28 +224,21 @@ def _normalised(row: tuple[float, ...], m: int) -> float:
     return m * (row[printed.SIZES.index((m, 1))] / SIGMA) ** 2
 
 
-def _numbers(values: list[float]) -> str:
-    return ", ".join(f"{v:.2f}" for v in values)
+def _compared(rows: Rows) -> dict[str, str]:
+    """Numbers of the text on rows over their proposed plan of 12: what repeating costs [%], and random plans."""
+    column = {label: {name: values[i] for name, values in rows.items()} for i, label in enumerate(printed.LABELS)}
+    return {
+        "few": signed(100 * (column["3×4"]["proposed"] - 1), 1),
+        "four": signed(100 * (column["4×3"]["proposed"] - 1), 1),
+        "min_12": number(column["12"]["random, min"]),
+        "mean_12": number(column["12"]["random, mean"]),
+        "mean_4": f"{column['4']['random, mean'] / column['4']['proposed']:.1f}",
+    }
 
 
-def _contradictions() -> list[str]:
-    return [
-        f"<li>{d.row}, {d.column}: printed {micrometres(d.printed)} µm. Column 4 over √3 is "
-        f"{micrometres(d.implied)} µm; the print is column 4 over 3.</li>"
-        for d in printed.contradictions()
-    ]
-
-
-# ── Fig. 5 ───────────────────────────────────────────────────────────────────────────────────────────
-
-
-def figure_5_values(result: Figure5, pictures: tuple[bytes, bytes]) -> dict[str, str]:
-    """Template values: the figure, its table, words."""
-    count, twelve = len(result.plans[0].errors), result.plans[-1]
-    caption = (
-        f"Error left at test pose A by {count} simulated calibrations with 12 measurements per plan; "
-        f"σ = 0.03 mm. The random plan is the median one of {DRAWN}."
-    )
+def _figure_5(result: Figure5) -> dict[str, Any]:
+    """What the template shows of Fig. 5."""
+    twelve = result.plans[-1]
     rows = [
         Row(
             (
@@ -341,56 +254,8 @@ def figure_5_values(result: Figure5, pictures: tuple[bytes, bytes]) -> dict[str,
     ]
     header = ("plan", "paper", "over its 12", "by (14)", "over our 12", "simulated")
     return {
-        "figure_5": picture(*pictures, caption),
-        "plans_5": table("Expected ρ0 [µm]; ± standard error", header, rows),
+        "plans_5": Table("Expected ρ0 [µm]; ± standard error", header, rows),
         "gain_5": signed(100 * result.gain, 0),
         "worst_5": f"{max(abs(p.simulated - p.expected) / p.standard_error for p in result.plans):.1f}",
         "error_5": f"{100 * twelve.standard_error / twelve.expected:.0f}",
     }
-
-
-# ── The files of a reproduction: ``tables.json``, figures as PNG and SVG, and the page ``index.html`` ───────
-
-
-def make_folder(folder: str | Path) -> Path:
-    """The folder, made if need be.
-
-    Raises:
-        InputError: It cannot be made.
-    """
-    path = Path(folder).expanduser()
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _refused(path, error) from None
-    return path
-
-
-def publish(result: Reproduction, folder: str | Path) -> None:
-    """Write all files to ``folder``, made if need be. Same result, same bytes.
-
-    Raises:
-        InputError: The folder cannot be made or written.
-    """
-    target = make_folder(folder)
-    pairs = {
-        "figure_2": [draw_two_link_figure(result.figure_2, narrow=n) for n in (False, True)],
-        "figure_3": [draw_two_link_figure(result.figure_3, narrow=n) for n in (False, True)],
-        "figure_5": [draw_figure_5(result.figure_5, narrow=n) for n in (False, True)],
-    }
-    pictures = {}
-    for name, (wide, narrow) in pairs.items():
-        pictures[name] = svg(wide), svg(narrow)
-        try:
-            (target / f"{name}.svg").write_bytes(pictures[name][0])
-            (target / f"{name}.png").write_bytes(png(wide))
-        except OSError as error:
-            raise _refused(target, error) from None
-    text = json.dumps(result.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
-    write_text(target / "tables.json", text + "\n")
-    write_text(target / "index.html", page(result, pictures))
-
-
-def _refused(folder: Path, error: OSError) -> InputError:
-    reason = f"{folder} ({error.strerror or error})"
-    return InputError("output", reason, "a folder that can be made and written", "choose another")

@@ -23,6 +23,8 @@ FIGURE_3_GAINS = (0.56, 0.18)
 
 SIZES = ((3, 1), (4, 1), (3, 4), (4, 3), (12, 1))
 """(configurations, measurements at each) of the columns of Table 2."""
+LABELS = tuple(str(m) if r == 1 else f"{m}×{r}" for m, r in SIZES)
+"""The headings of these columns."""
 
 TABLE_2 = {
     "random, max": (47.1, 8078e-6, 23.6, 2693e-6, 144e-6),
@@ -58,11 +60,11 @@ def contradictions(rows: Mapping[str, tuple[float, ...]] = TABLE_2, tolerance: f
     Repeating every measurement r times multiplies the information matrix by r, so ρ0 of any plan, and with it
     every statistic over the same plans, is divided by √r. The tolerance leaves room for rounding.
     """
-    found = []
+    doubtful = []
     for row, values in rows.items():
         single = {m: value for (m, r), value in zip(SIZES, values, strict=True) if r == 1}
-        for (m, r), value in zip(SIZES, values, strict=True):
+        for (m, r), label, value in zip(SIZES, LABELS, values, strict=True):
             implied = single[m] / r**0.5
             if abs(value / implied - 1) > tolerance:
-                found.append(Doubtful(row, f"{m}×{r}", value, implied))
-    return found
+                doubtful.append(Doubtful(row, label, value, implied))
+    return doubtful

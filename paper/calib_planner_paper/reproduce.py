@@ -39,7 +39,7 @@ class Reproduction:
     """The paper's tables and figures as numbers.
 
     Attributes:
-        settings: What was asked.
+        settings: How much was computed.
         table_1: The two-link arm.
         figure_2, figure_3: Simulated calibrations of it.
         table_2: The KUKA KR 270, one table per test pose; the first is the one to compare.

@@ -1,8 +1,23 @@
-"""Section 5, the two-link arm. Its closed form (20), beside which the library's numbers stand, follows from
+"""Section 5: the two-link arm of Table 1 and of Figs 2 and 3.
+
+Its closed form, beside which the library's numbers stand, follows from
 
     ρ0²/σ² = 2 (m − cos q20 · S) / (m² − S²),   S = Σ cos q2i                       (18)
 
-for Π = (Δl1, Δl2) or (Δq1, Δq2): the slope in S is zero at S* = m (1 − |sin q20|) / cos q20, eq. (19).
+for Π = (Δl1, Δl2) or (Δq1, Δq2). The derivative in S is zero at S* = m (1 − |sin q20|) / cos q20, eq. (19), which
+leaves ρ0²/σ² = (1 + |sin q20|) / m, eq. (20).
+
+*Table 1* says how much the test-pose criterion gains over D-optimality with m = 2. Three sources stand beside
+each other: the print, the closed form (20), and the library: the planner's own plan with its proven lower bound,
+and the D-optimal plan put into eq. (14).
+
+*Figs 2 and 3* show a hundred simulated calibrations with each of three plans, which are the paper's. Beside them
+stand the plan that the planner makes for the same problem and the bound that no plan of as many measurements can
+beat. Fig. 2 identifies the link lengths from two measurements; its plan c is (19), its plan b D-optimal. Fig. 3
+identifies lengths and joint offsets from three measurements. Its hypothesis is that (18)–(20) hold for all four
+parameters. They do, with twice the variance, for plans with Σ sin q2i = 0 such as its three. Among other plans
+there are better ones: m measurements at the test pose itself leave 2σ²/m there, and by the bound no plan leaves
+less.
 """
 
 from __future__ import annotations
@@ -13,13 +28,10 @@ from typing import Any
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.planning import Plan, PlanProblem, Search, plan
+from calib_planner.planning import PlanProblem, Search, plan
 from calib_planner.robot import Robot
 from calib_planner_paper import printed
 from calib_planner_paper.calibrations import Calibrations, Laboratory, calibrate, error_covariance
-
-LENGTHS = "l1,l2"
-ALL_FOUR = "lengths+offsets"
 
 
 def two_link(parameters: str) -> Robot:
@@ -32,20 +44,19 @@ def bent(degrees: tuple[float, ...]) -> FloatArray:
     return np.radians([[0.0, angle] for angle in degrees])
 
 
-def least_variance(m: int, q20: float) -> float:
-    """ρ0²/σ² of eq. (20), the least that m measurements reach; q20 [rad]."""
-    return float((1 + abs(np.sin(q20))) / m)
-
-
-# ── Table 1: how much the test-pose criterion gains over D-optimality on the two-link arm, m = 2 ────────────
-# Three sources stand beside each other: the print, the closed form (20), and the library — the planner's own plan
-# with its proven lower bound, and the D-optimal plan put into eq. (14).
-
+LENGTHS = "l1,l2"
 CONFIGURATIONS = 2
+"""m of Table 1."""
 D_OPTIMAL = bent((-90.0, 90.0))
 """S = Σ cos q2i = 0."""
 HALF_A_DIGIT = 0.005
 """A printed variance further from the closed form than this is not its rounding."""
+TEST_POSE = np.radians([-45.0, 20.0])
+SIGMA = 1e-3
+"""Of Figs 2 and 3: (2,) [rad] and standard deviation of one coordinate [m]."""
+
+
+# ── Table 1 ──────────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True)
@@ -73,6 +84,11 @@ class Column:
     d_optimal: float
 
     @property
+    def angle(self) -> str:
+        """``q20`` as the table's heading."""
+        return f"{np.degrees(self.q20):.0f}°"
+
+    @property
     def gain(self) -> float:
         """ρ_D/ρ0 − 1 of the plans computed here."""
         return float(np.sqrt(self.d_optimal / self.planned) - 1)
@@ -82,10 +98,6 @@ class Column:
         """Whether the printed variance is not the closed form's, rounded."""
         return abs(self.printed - self.closed_form) > HALF_A_DIGIT
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers; ``q20`` in rad, gains as shares."""
-        return {**vars(self), "gain": self.gain, "misprinted": self.misprinted}
-
 
 @dataclass(frozen=True)
 class Table1:
@@ -94,49 +106,36 @@ class Table1:
     columns: tuple[Column, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers."""
-        return {"configurations": CONFIGURATIONS, "columns": [c.to_dict() for c in self.columns]}
+        """Plain numbers; ``q20`` in rad, gains as shares."""
+        columns = [{**vars(c), "gain": c.gain, "misprinted": c.misprinted} for c in self.columns]
+        return {"configurations": CONFIGURATIONS, "columns": columns}
 
 
 def table_1(seed: int) -> Table1:
-    """Plan for every test pose of the table."""
+    """Plan for every test pose of the table by the paper's plain criterion, with σ = 1."""
+    robot, columns = two_link(LENGTHS), []
     rows = zip(printed.TABLE_1_ANGLES, printed.TABLE_1_VARIANCE, printed.TABLE_1_GAIN, strict=True)
-    return Table1(tuple(_column(np.radians(angle), v, gain / 100, seed) for angle, v, gain in rows))
+    for angle, variance, gain in rows:
+        pose = np.array([0.0, np.radians(angle)])
+        search = Search(general_weight=0.0, starts=16, seed=seed)
+        problem = PlanProblem(robot, pose, CONFIGURATIONS, noise=1.0, search=search)
+        best = plan(problem, prove=True)
+        columns.append(
+            Column(
+                q20=float(pose[1]),
+                printed=variance,
+                printed_gain=gain / 100,
+                closed_form=float((1 + abs(np.sin(pose[1]))) / CONFIGURATIONS),  # (20)
+                planned=best.quality.predicted_accuracy**2,
+                lower_bound=best.quality.lower_bound**2,
+                bound=best.quality.bound,
+                d_optimal=float(np.trace(error_covariance(robot, D_OPTIMAL, 1, pose, 1.0))),
+            )
+        )
+    return Table1(tuple(columns))
 
 
-def _column(q20: float, variance: float, gain: float, seed: int) -> Column:
-    found = _plan(q20, seed)
-    pose = np.array([0.0, q20])
-    return Column(
-        q20=float(q20),
-        printed=variance,
-        printed_gain=gain,
-        closed_form=least_variance(CONFIGURATIONS, q20),
-        planned=found.quality.predicted_accuracy**2,
-        lower_bound=found.quality.lower_bound**2,
-        bound=found.quality.bound,
-        d_optimal=float(np.trace(error_covariance(two_link(LENGTHS), D_OPTIMAL, 1, pose, 1.0))),
-    )
-
-
-def _plan(q20: float, seed: int) -> Plan:
-    """The paper's plain criterion with σ = 1."""
-    problem = PlanProblem(
-        two_link(LENGTHS),
-        [0.0, q20],
-        CONFIGURATIONS,
-        noise=1.0,
-        search=Search(general_weight=0.0, starts=16, seed=seed),
-    )
-    return plan(problem, prove=True)
-
-
-# ── What Figs 2 and 3 are: three plans for the two-link arm and a hundred simulated calibrations with each ───
-# The plans are the paper's; beside them stands what the planner finds for the same problem, and the bound that no
-# plan of as many measurements can beat.
-
-TEST_POSE = np.radians([-45.0, 20.0])
-SIGMA = 1e-3
+# ── Figs 2 and 3 ─────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True)
@@ -154,6 +153,15 @@ class FigureSettings:
     parameters: str
     angles: tuple[tuple[float, ...], ...]
     printed_gains: tuple[float, float]
+
+
+FIGURE_2 = FigureSettings(2, LENGTHS, ((-10.0, 10.0), (-90.0, 90.0), (-46.0, 46.0)), printed.FIGURE_2_GAINS)
+FIGURE_3 = FigureSettings(
+    3,
+    "lengths+offsets",
+    ((-10.0, 0.0, 10.0), (-120.0, 0.0, 120.0), (-57.0, 0.0, 57.0)),
+    printed.FIGURE_3_GAINS,
+)
 
 
 @dataclass(frozen=True)
@@ -175,18 +183,12 @@ class Gain:
     standard_error: float
 
 
-def _gain(best: Calibrations, other: Calibrations, printed: float) -> Gain:
-    expected, simulated = best.expected / other.expected, best.simulated / other.simulated
-    relative = np.hypot(best.standard_error / best.expected, other.standard_error / other.expected)
-    return Gain(other.label, printed, 1 - expected, 1 - simulated, float(expected * relative))
-
-
 @dataclass(frozen=True, eq=False)
 class TwoLinkFigure:
     """The figure's numbers.
 
     Attributes:
-        settings: What was asked.
+        settings: Which figure it is.
         plans: Plans a, b and c.
         planned: ρ0 of the planner's plan for the same problem [m].
         planned_configurations: That plan, (m, 2) [rad].
@@ -195,19 +197,21 @@ class TwoLinkFigure:
     """
 
     settings: FigureSettings
-    plans: tuple[Calibrations, Calibrations, Calibrations]
+    plans: tuple[Calibrations, ...]
     planned: float
     planned_configurations: FloatArray
     lower_bound: float
     bound: str
 
-    def gains(self) -> tuple[Gain, Gain]:
+    def gains(self) -> list[Gain]:
         """What c gains over a and over b."""
-        a, b = (
-            _gain(self.plans[2], other, value)
-            for other, value in zip(self.plans[:2], self.settings.printed_gains, strict=True)
-        )
-        return a, b
+        *others, c = self.plans
+        gains = []
+        for other, value in zip(others, self.settings.printed_gains, strict=True):
+            expected, simulated = c.expected / other.expected, c.simulated / other.simulated
+            relative = np.hypot(c.standard_error / c.expected, other.standard_error / other.expected)
+            gains.append(Gain(other.label, value, 1 - expected, 1 - simulated, float(expected * relative)))
+        return gains
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers [m, rad]."""
@@ -230,37 +234,11 @@ def two_link_figure(settings: FigureSettings, count: int, seed: int) -> TwoLinkF
     """Simulate ``count`` calibrations with each plan, and plan for the same problem."""
     robot = two_link(settings.parameters)
     laboratory = Laboratory(robot, TEST_POSE, SIGMA, count, seed)
-    first = 10 * settings.number
-    a, b, c = (
-        calibrate(laboratory, name, bent(angles), 1, first + k)
+    plans = [
+        calibrate(laboratory, name, bent(angles), 1, 10 * settings.number + k)
         for k, (name, angles) in enumerate(zip("abc", settings.angles, strict=True))
-    )
-    problem = PlanProblem(
-        robot, TEST_POSE, len(settings.angles[0]), noise=SIGMA, search=Search(starts=16, seed=seed)
-    )
-    best = plan(problem, prove=True)
+    ]
+    search = Search(starts=16, seed=seed)
+    best = plan(PlanProblem(robot, TEST_POSE, len(settings.angles[0]), noise=SIGMA, search=search), prove=True)
     accuracy, bound = best.quality.predicted_accuracy, best.quality.lower_bound
-    return TwoLinkFigure(settings, (a, b, c), accuracy, best.configurations, bound, best.quality.bound)
-
-
-# ── Fig. 2: the link lengths of the two-link arm from two measurements. Plan c is (19), plan b D-optimal ────
-
-FIGURE_2 = FigureSettings(
-    number=2,
-    parameters=LENGTHS,
-    angles=((-10.0, 10.0), (-90.0, 90.0), (-46.0, 46.0)),
-    printed_gains=printed.FIGURE_2_GAINS,
-)
-
-
-# ── Fig. 3: lengths and joint offsets of the two-link arm from three measurements ───────────────────────────
-# The paper's hypothesis is that (18)–(20) hold for all four parameters. They do, with twice the variance, for
-# plans with Σ sin q2i = 0 such as its three. Among other plans there are better ones: m measurements at the test
-# pose itself leave 2σ²/m there, and the bound says that nothing is below.
-
-FIGURE_3 = FigureSettings(
-    number=3,
-    parameters=ALL_FOUR,
-    angles=((-10.0, 0.0, 10.0), (-120.0, 0.0, 120.0), (-57.0, 0.0, 57.0)),
-    printed_gains=printed.FIGURE_3_GAINS,
-)
+    return TwoLinkFigure(settings, tuple(plans), accuracy, best.configurations, bound, best.quality.bound)

@@ -181,7 +181,7 @@ def test_a_finished_campaign_is_finished_again():
     state = state.decided(decide(state))
     assert isinstance(state.action, Finished)
     again = state.action.result
-    np.testing.assert_array_equal(again.estimate.deviations, done.estimate.deviations)
+    np.testing.assert_array_equal(again.estimate.fit.deviations, done.estimate.fit.deviations)
     assert again.verdict == done.verdict and again.outcome == done.outcome
 
 

@@ -62,7 +62,7 @@ def true_deviations(problem: IdentificationProblem, found, truth: Robot) -> np.n
     robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
     low, high = robot.joint_limits.T
     q = np.random.default_rng(1).uniform(low, high, (100, len(low)))
-    kept, x = np.flatnonzero(np.isfinite(found.std)), np.array(found.deviations)
+    kept, x = np.flatnonzero(np.isfinite(found.fit.std)), np.array(found.fit.deviations)
     for _ in range(6):
         jacobian = np.ascontiguousarray(robot.jacobian(q, x)).reshape(-1, len(x))[:, kept]
         scale = np.linalg.norm(jacobian, axis=0)
@@ -123,4 +123,4 @@ def spoil(
 
 def rejected(found) -> set[tuple[int, int]]:
     """(row, target) from 0 of the points not used."""
-    return {(point["row"], point["target"] - 1) for point in found.rejected}
+    return {(point.row, point.target - 1) for point in found.points.rejected}

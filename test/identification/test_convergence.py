@@ -27,10 +27,10 @@ def test_robots_far_from_nominal_are_found(name, loss):
         cell = SimulatedCell(robot, random_deviations(robot, seed, 1e-2, 5e-2), SIGMA)
         data = bare(cell.measure(random_configurations(robot, 25, seed), 1, seed))
         found = identify(IdentificationProblem(robot, data, sigma=SIGMA, loss=loss, joint_corrections="off"))
-        assert found.status != "not_converged"
-        assert found.agreeing_starts == found.starts == 2
-        assert found.chi_square.probability > 1e-7
-        assert found.iterations <= 15
+        assert found.fit.status != "not_converged"
+        assert found.diagnostics.agreeing_starts == found.diagnostics.starts == 2
+        assert found.residuals.chi_square.probability > 1e-7
+        assert found.fit.iterations <= 15
         errors = cell.position_errors(found.calibrated, random_configurations(robot, 50, seed + 50))
         assert np.sqrt(np.mean(errors**2)) < 4 * SIGMA
 
@@ -41,8 +41,8 @@ def test_cells_anywhere_are_found(loss):
         cell, asked = placed_cell(seed)
         data = bare(cell.measure(random_configurations(asked, 40, seed), 1, seed))
         found = identify(IdentificationProblem(asked, data, sigma=SIGMA, loss=loss))
-        assert found.status == "rank_deficient"
-        assert found.agreeing_starts == found.starts == 2
+        assert found.fit.status == "rank_deficient"
+        assert found.diagnostics.agreeing_starts == found.diagnostics.starts == 2
         errors = cell.position_errors(found.calibrated, random_configurations(asked, 50, seed + 50))
         assert np.sqrt(np.mean(errors**2)) < 4 * SIGMA
 
@@ -56,10 +56,10 @@ def test_starts_disagree_where_there_is_a_second_minimum(loss):
     cell = SimulatedCell(robot, dict(zip(robot.parameter_names, truth, strict=True)), 1e-5)
     problem = IdentificationProblem(robot, bare(cell.measure(q, 1, 1)), sigma=1e-5, loss=loss, starts=20)
     found = identify(problem)
-    assert found.chi_square.probability > 1e-4
-    bent = 0.006 + np.array([truth[1], found.deviations[1]])
+    assert found.residuals.chi_square.probability > 1e-4
+    bent = 0.006 + np.array([truth[1], found.fit.deviations[1]])
     assert abs(bent[0]) == pytest.approx(abs(bent[1]), rel=0.1)  # whichever it is, it fits
-    assert 0 < found.agreeing_starts < found.starts
+    assert 0 < found.diagnostics.agreeing_starts < found.diagnostics.starts
     assert "other_minimum" in {r.code for r in found.verdict.reasons}
     moving = q + np.linspace([0.0, 0.0], [0.0, 0.05], 12)
     clear = IdentificationProblem(robot, bare(cell.measure(moving, 1, 1)), sigma=1e-5, loss=loss, starts=20)
@@ -77,8 +77,8 @@ def test_best_minimum_is_taken():
     for starts in (0, 40):
         problem = IdentificationProblem(robot, data, sigma=1e-6, starts=starts, discrepancy="off")
         ends.append(identify(problem))
-    assert ends[1].chi_square.value <= ends[0].chi_square.value * (1 + 1e-9)
-    np.testing.assert_allclose(ends[1].deviations, [cell.deviations[n] for n in names], atol=1e-4)
+    assert ends[1].residuals.chi_square.value <= ends[0].residuals.chi_square.value * (1 + 1e-9)
+    np.testing.assert_allclose(ends[1].fit.deviations, [cell.deviations[n] for n in names], atol=1e-4)
 
 
 def test_start_elsewhere_ends_in_the_same_place():
@@ -90,7 +90,7 @@ def test_start_elsewhere_ends_in_the_same_place():
         cold = identify(problem)
         first = identify(IdentificationProblem(asked, data.select(np.arange(25)), sigma=SIGMA))
         warm = identify(problem, start=first)
-        assert warm.held == cold.held
+        assert warm.observability.fixed == cold.observability.fixed
         q = random_configurations(asked, 30, 77)
         apart = warm.calibrated.positions(q) - cold.calibrated.positions(q)
         assert np.abs(apart).max() < 1e-3 * SIGMA
@@ -101,4 +101,4 @@ def test_too_few_iterations_are_said():
     cell = SimulatedCell(robot, random_deviations(robot, 1, 1e-2, 5e-2), SIGMA)
     data = bare(cell.measure(random_configurations(robot, 20, 1), 1, 1))
     found = identify(IdentificationProblem(robot, data, sigma=SIGMA, iterations=1))
-    assert found.status == "not_converged" and found.verdict.level == "FAIL"
+    assert found.fit.status == "not_converged" and found.verdict.level == "FAIL"

@@ -85,7 +85,9 @@ def test_the_size_is_that_of_the_errors() -> None:
 def test_breaks_are_found(place: str, seed: int) -> None:
     robot, data = clean(seed, place)
     found = identify(IdentificationProblem(robot, broken(data, seed, 2e-4), sigma=SIGMA, starts=0))
-    assert [d.kind for d in found.disturbances] == ["distance"] and found.disturbances[0].instead
+    assert [d.kind for d in found.diagnostics.disturbances] == ["distance"] and found.diagnostics.disturbances[
+        0
+    ].instead
     (reason,) = (r for r in found.verdict.reasons if r.code == "distance")
     assert reason.level == found.verdict.level == "WARN"
 
@@ -97,7 +99,7 @@ def test_a_robot_that_errs_is_none_of_it(seed: int) -> None:
         wrong = WrongRobot(seed, turning, 0.07, white)
         data = wrong.measure(random_configurations(wrong.asked, 40, seed))
         found = identify(IdentificationProblem(wrong.asked, data, sigma=SIGMA, starts=0))
-        assert found.noise.discrepancy > 0 and found.disturbances == ()
+        assert found.noise.discrepancy > 0 and found.diagnostics.disturbances == ()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -114,7 +116,7 @@ def test_a_target_seated_elsewhere_that_passes_for_a_discrepancy(seed: int) -> N
         cell.truth.with_targets(seat).positions(data.q) - cell.truth.positions(data.q),
     )
     found = identify(IdentificationProblem(nominal, bare(data, data.p + moved), sigma=SIGMA / 4, starts=0))
-    (best,) = found.disturbances
+    (best,) = found.diagnostics.disturbances
     assert found.noise.discrepancy > 1e-5 and best.instead
     assert (best.kind, best.row) == ("reseat", 12)
     assert np.linalg.norm(best.translation) == pytest.approx(3e-4, rel=0.1)

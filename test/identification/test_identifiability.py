@@ -13,7 +13,7 @@ from robots import CASES, mixed, random_configurations
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.errors import CalibPlannerError
 from calib_planner.identification import Prior, typical_prior
-from calib_planner.robot import analyse, describe
+from calib_planner.robot import analyse, describe, is_nuisance
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 UNKNOWN = {"": (), " base": ("base",), " base tool": ("base", "tool")}
@@ -64,7 +64,7 @@ def test_priority_is_base_and_targets_then_the_request(name):
     """Each parameter is kept if and only if those before it leave something of its column."""
     robot = ROBOTS[name]()
     jacobian, names = stacked(robot), robot.parameter_names
-    placed = [i for i, n in enumerate(names) if n.startswith(("base.", "target_"))]
+    placed = [i for i, n in enumerate(names) if is_nuisance(n)]
     order = placed + [i for i in range(len(names)) if i not in placed]
     norms = np.linalg.norm(jacobian, axis=0)
     unit = jacobian / np.where(norms > 1e-9, norms, np.inf)
@@ -114,19 +114,19 @@ def test_what_noise_hides_is_held_named_and_left_to_the_prior(lever, seen):
     cell = SimulatedCell(asked, {"d2": 1e-3, "q2": 1e-3, "q6": 1e-3}, SIGMA)
     data = bare(cell.measure(q, 1, 3))
     found = identify(IdentificationProblem(asked, data, sigma=SIGMA, test_poses=q[:3]))
-    assert found.held == (() if seen else ("q6",))
-    assert found.status == ("ok" if seen else "rank_deficient")
+    assert found.observability.fixed == (() if seen else ("q6",))
+    assert found.fit.status == ("ok" if seen else "rank_deficient")
     if seen:
-        assert abs(found.deviations[2] - 1e-3) < 4.5 * found.std[2] < 4.5e-3
+        assert abs(found.fit.deviations[2] - 1e-3) < 4.5 * found.fit.std[2] < 4.5e-3
         return
-    assert found.unidentifiable[0].startswith(("q6", "1·q6"))
-    assert found.deviations[2] == 0.0 and np.isnan(found.std[2])
-    assert np.isfinite(found.predicted_accuracy_per_test_pose).all()
+    assert found.observability.unidentifiable[0].startswith(("q6", "1·q6"))
+    assert found.fit.deviations[2] == 0.0 and np.isnan(found.fit.std[2])
+    assert np.isfinite(found.accuracy.predicted).all()
     prior = Prior(("q6",), [0.02], [1e-3])
     with_prior = identify(IdentificationProblem(asked, data, sigma=SIGMA, prior=prior))
-    assert with_prior.held == () and len(with_prior.resolved_by_prior) == 1
-    assert with_prior.values[2] == pytest.approx(0.02, abs=2e-3)
-    assert with_prior.std[2] == pytest.approx(1e-3, rel=0.05)
+    assert with_prior.observability.fixed == () and len(with_prior.observability.resolved_by_prior) == 1
+    assert with_prior.fit.values[2] == pytest.approx(0.02, abs=2e-3)
+    assert with_prior.fit.std[2] == pytest.approx(1e-3, rel=0.05)
 
 
 def test_poses_that_rest_on_what_was_not_seen_are_blind():
@@ -138,7 +138,7 @@ def test_poses_that_rest_on_what_was_not_seen_are_blind():
     poses = np.vstack([q[7], random_configurations(robot, 2, 6)])
     poses[0, 0] = 0.33
     found = identify(IdentificationProblem(robot, bare(cell.measure(q, 1, 5)), sigma=SIGMA, test_poses=poses))
-    per = found.predicted_accuracy_per_test_pose
+    per = found.accuracy.predicted
     assert per[0] < SIGMA and np.isinf(per[1:]).all()
     assert found.verdict.level == "FAIL"
     (reason,) = [r for r in found.verdict.reasons if r.code == "blind_test_pose"]
@@ -151,8 +151,8 @@ def test_poses_that_rest_on_what_was_not_seen_are_blind():
             robot, bare(cell.measure(q, 1, 5)), sigma=SIGMA, test_poses=poses, prior=typical_prior(robot)
         )
     )
-    assert np.isfinite(resolved.predicted_accuracy_per_test_pose).all()
-    assert resolved.predicted_accuracy_per_test_pose[1] > 1e-3  # nothing but the prior knows
+    assert np.isfinite(resolved.accuracy.predicted).all()
+    assert resolved.accuracy.predicted[1] > 1e-3  # nothing but the prior knows
 
 
 # ── degenerate sets ──────────────────────────────────────────────────────────────────────────────────
@@ -267,12 +267,12 @@ def test_degenerate_sets_give_a_verdict_or_a_typed_error(name, sigma, options):
         document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert words is None or prior is not None
     assert nulls(document) <= MAY_BE_NULL
-    assert found.status in ("ok", "rank_deficient")
-    assert np.isfinite(found.deviations).all()
-    known = np.isfinite(found.sigma)
-    assert np.isfinite(found.covariance).all() == (known or prior is not None)
+    assert found.fit.status in ("ok", "rank_deficient")
+    assert np.isfinite(found.fit.deviations).all()
+    known = np.isfinite(found.noise.sigma)
+    assert np.isfinite(found.fit.covariance).all() == (known or prior is not None)
     assert known or found.verdict.level == "FAIL"
-    per = found.predicted_accuracy_per_test_pose
+    per = found.accuracy.predicted
     assert not known or not np.isnan(per).any()
     assert not np.isinf(per).any() or found.verdict.level == "FAIL"
     for reason in found.verdict.reasons:

@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from calib_planner import IdentificationProblem, InputError, Robot, UnknownNameError, identify
 from calib_planner.identification import Prior, typical_prior
 from calib_planner.identification.problem import ANGLE_STD, LENGTH_STD, OFFSET_STD
+from calib_planner.robot import is_nuisance
 from calib_planner.simulation import SimulatedCell, random_deviations
 from calib_planner.tracker import LaserTracker
 
@@ -70,11 +71,11 @@ def test_estimate_is_the_maximum_a_posteriori_of_scipy(name, instrument):
     )
     covariance = np.linalg.inv(oracle.jac.T @ oracle.jac)
     std = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(found.deviations / usual(robot), oracle.x, atol=2e-3 * std.min())
-    np.testing.assert_allclose(found.std / usual(robot), std, rtol=1e-4)
-    scaled = found.covariance / np.outer(found.std, found.std)
+    np.testing.assert_allclose(found.fit.deviations / usual(robot), oracle.x, atol=2e-3 * std.min())
+    np.testing.assert_allclose(found.fit.std / usual(robot), std, rtol=1e-4)
+    scaled = found.fit.covariance / np.outer(found.fit.std, found.fit.std)
     np.testing.assert_allclose(scaled, covariance / np.outer(std, std), atol=1e-4)
-    assert found.chi_square.value == pytest.approx(2 * oracle.cost, rel=1e-6)
+    assert found.residuals.chi_square.value == pytest.approx(2 * oracle.cost, rel=1e-6)
 
 
 def drawn(seed: int, level: str, count: int, targets=((0.1, 0.05, 0.1),)):
@@ -94,10 +95,10 @@ def test_uncertainty_is_right_where_the_truth_comes_from_the_prior(level, count,
         cell, prior, data = drawn(seed, level, count)
         problem = IdentificationProblem(cell.nominal, data, sigma=SIGMA, prior=prior, loss=loss, starts=0)
         found = identify(problem)
-        assert found.status == "ok"
-        error = found.deviations - np.array([cell.deviations[n] for n in found.parameters])
-        scale = np.sqrt(np.diag(found.covariance))
-        total += (error / scale) @ np.linalg.solve(found.covariance / np.outer(scale, scale), error / scale)
+        assert found.fit.status == "ok"
+        error = found.fit.deviations - np.array([cell.deviations[n] for n in found.fit.parameters])
+        scale = np.sqrt(np.diag(found.fit.covariance))
+        total += (error / scale) @ np.linalg.solve(found.fit.covariance / np.outer(scale, scale), error / scale)
         freedom += len(error)
     assert chi2.ppf(1e-4, freedom) < total < chi2.isf(1e-4, freedom)
 
@@ -109,7 +110,7 @@ def test_unknown_noise_beside_a_prior_is_neither_over_nor_underestimated(level, 
     for seed in range(30):
         cell, prior, data = drawn(seed, level, count)
         found = identify(IdentificationProblem(cell.nominal, data, prior=prior, starts=0))
-        assert found.status == "ok"
+        assert found.fit.status == "ok"
         squares.append((found.noise.measurement / SIGMA) ** 2)
     assert np.mean(squares) == pytest.approx(1.0, abs=4 * np.std(squares) / np.sqrt(len(squares)))
 
@@ -121,26 +122,26 @@ def test_fewer_equations_than_parameters(count, loss):
     cell, prior, data = drawn(1, "lengths+offsets", count)
     problem = IdentificationProblem(cell.nominal, data, sigma=SIGMA, prior=prior, loss=loss)
     found = identify(problem)
-    assert found.status == "ok"
-    assert (found.std <= usual(cell.nominal) * (1 + 1e-9)).all()
+    assert found.fit.status == "ok"
+    assert (found.fit.std <= usual(cell.nominal) * (1 + 1e-9)).all()
     unknown = identify(IdentificationProblem(cell.nominal, data, prior=prior, loss=loss))
     assert unknown.verdict.level == "FAIL"
     assert "no_uncertainty" in {r.code for r in unknown.verdict.reasons}
-    assert np.isfinite(unknown.deviations).all()
+    assert np.isfinite(unknown.fit.deviations).all()
 
 
 def test_no_prior_and_flat_prior_are_the_same_and_a_sharp_one_wins():
     cell, asked = plain_cell(2)
     data = bare(cell.measure(random_configurations(asked, 15, 2), 1, 2))
     without = identify(IdentificationProblem(asked, data, sigma=SIGMA))
-    count = len(without.parameters)
-    flat = Prior(without.parameters, nominal(asked), np.full(count, 1e3))
-    sharp = Prior(without.parameters, nominal(asked) + 1e-3, np.full(count, 1e-9))
+    count = len(without.fit.parameters)
+    flat = Prior(without.fit.parameters, nominal(asked), np.full(count, 1e3))
+    sharp = Prior(without.fit.parameters, nominal(asked) + 1e-3, np.full(count, 1e-9))
     found = identify(IdentificationProblem(asked, data, sigma=SIGMA, prior=flat))
-    np.testing.assert_allclose(found.deviations, without.deviations, atol=1e-3 * without.std.min())
-    np.testing.assert_allclose(found.std, without.std, rtol=1e-6)
+    np.testing.assert_allclose(found.fit.deviations, without.fit.deviations, atol=1e-3 * without.fit.std.min())
+    np.testing.assert_allclose(found.fit.std, without.fit.std, rtol=1e-6)
     held = identify(IdentificationProblem(asked, data, sigma=SIGMA, prior=sharp, discrepancy="off"))
-    np.testing.assert_allclose(held.values, nominal(asked) + 1e-3, atol=1e-7)
+    np.testing.assert_allclose(held.fit.values, nominal(asked) + 1e-3, atol=1e-7)
 
 
 def test_prior_decides_what_the_data_cannot_see():
@@ -149,13 +150,13 @@ def test_prior_decides_what_the_data_cannot_see():
     cell = SimulatedCell(robot.with_parameters("d2"), {"d2": 1e-3}, SIGMA)
     data = bare(cell.measure(random_configurations(robot, 12, 1), 1, 1))
     without = identify(IdentificationProblem(robot, data, sigma=SIGMA))
-    assert set(without.held) == {"q6", "q1"}
+    assert set(without.observability.fixed) == {"q6", "q1"}
     prior = Prior(("q1", "q6"), [0.002, 0.3], [1e-4, 1e-3])
     found = identify(IdentificationProblem(robot, data, sigma=SIGMA, prior=prior))
-    assert found.status == "ok"
-    assert found.held == found.unidentifiable == ()
-    assert len(found.resolved_by_prior) == 2
-    got = dict(zip(found.parameters, zip(found.values, found.std, strict=True), strict=True))
+    assert found.fit.status == "ok"
+    assert found.observability.fixed == found.observability.unidentifiable == ()
+    assert len(found.observability.resolved_by_prior) == 2
+    got = dict(zip(found.fit.parameters, zip(found.fit.values, found.fit.std, strict=True), strict=True))
     assert got["q6"] == pytest.approx((0.3, 1e-3), rel=1e-6)
     assert got["q1"] == pytest.approx((0.002, 1e-4), rel=1e-6)
     q = random_configurations(robot, 50, 2)
@@ -203,7 +204,7 @@ def test_typical_prior():
     """Lengths and angles by unit; whatever acts as a joint's zero nearly free; base and targets not at all."""
     robot = Robot.load("kuka_kr270").with_targets(np.zeros((1, 3))).with_parameters("full", ("base", "tool"))
     prior = typical_prior(robot)
-    kinematic = [p for p in robot.parameters if not p.name.startswith(("base.", "target_"))]
+    kinematic = [p for p in robot.parameters if not is_nuisance(p.name)]
     assert prior.names == tuple(p.name for p in kinematic)
     np.testing.assert_array_equal(prior.values, [p.nominal for p in kinematic])
     std = dict(zip(prior.names, np.sqrt(np.diag(prior.covariance)), strict=True))

@@ -75,7 +75,7 @@ def test_columns_against_central_differences(make):
         np.testing.assert_allclose(columns[..., at], (moved[0] - moved[1]) / (2 * step), atol=1e-8)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 @pytest.mark.parametrize("known", [True, False], ids=["sigma known", "sigma unknown"])
 def test_erring_joints_are_learnt(seed, known):
     """Fresh poses: far better than geometry alone, and as far off as predicted."""
@@ -139,7 +139,7 @@ def test_measured_ur10():
     folder = SHARED_DATA / "ur10_tracker"
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
     data = read_measurements(folder / "random_poses.csv", robot).data
-    for seed in (0, 1):
+    for seed in (0,):
         rows = np.random.default_rng(seed).choice(len(data), 100, replace=False)
         rest = data.select(np.setdiff1d(np.arange(len(data)), rows))
         problem = IdentificationProblem(robot, data.select(rows))

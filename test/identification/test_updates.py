@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -126,8 +127,20 @@ def at_once(problem: IdentificationProblem) -> Estimate | None:
         return None
 
 
+SAME = (
+    "fit.parameters",
+    "fit.status",
+    "observability.fixed",
+    "observability.rank",
+    "observability.unidentifiable",
+    "points.used",
+    "points.measured",
+    "diagnostics.starts",
+)
+
+
 def rejected(estimate: Estimate) -> list[tuple[int, int]]:
-    return [(r["row"], r["target"]) for r in estimate.rejected]
+    return [(r.row, r.target) for r in estimate.points.rejected]
 
 
 def assert_same(one: Estimate | None, other: Estimate | None) -> None:
@@ -136,14 +149,14 @@ def assert_same(one: Estimate | None, other: Estimate | None) -> None:
     if one is None or other is None:
         return
     assert rejected(one) == rejected(other)
-    for name in ("parameters", "held", "rank", "unidentifiable", "used", "measurements", "status", "starts"):
-        assert getattr(one, name) == getattr(other, name), name
-    for name in ("values", "std", "covariance", "residuals", "predicted_accuracy_per_test_pose"):
-        a, b = getattr(one, name), getattr(other, name)
+    for name in SAME:
+        assert attrgetter(name)(one) == attrgetter(name)(other), name
+    for name in ("fit.values", "fit.std", "fit.covariance", "residuals.vectors", "accuracy.predicted"):
+        a, b = attrgetter(name)(one), attrgetter(name)(other)
         np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE, err_msg=name)
-    np.testing.assert_allclose(one.normalised_residuals, other.normalised_residuals, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(one.residuals.normalised, other.residuals.normalised, rtol=1e-5, atol=1e-5)
     for name in ("rms", "max"):
-        a, b = (getattr(e.residual_before, name) for e in (one, other))
+        a, b = (getattr(e.residuals.before, name) for e in (one, other))
         assert a == pytest.approx(b, abs=TOLERANCE, nan_ok=True)
     assert one.noise.source == other.noise.source
     assert one.noise.discrepancy == pytest.approx(other.noise.discrepancy, abs=TOLERANCE)
@@ -155,7 +168,11 @@ def assert_same(one: Estimate | None, other: Estimate | None) -> None:
 
 def updated(problem: IdentificationProblem, last: Estimate | None) -> Estimate | None:
     """The next estimate as the identifier node makes it: from the last one, once that can only be near."""
-    near = last is not None and last.status != "not_converged" and 3 * last.used >= 2 * len(last.parameters)
+    near = (
+        last is not None
+        and last.fit.status != "not_converged"
+        and 3 * last.points.used >= 2 * len(last.fit.parameters)
+    )
     try:
         return identify(problem, last if near else None)
     except NotEnoughDataError:
@@ -180,7 +197,7 @@ def test_the_same_as_all_at_once(name: str) -> None:
         problem = IdentificationProblem(robot, data.select(np.arange(count)), **settings)
         assert_same(estimates[count], at_once(problem))
     newest = estimates[-1]
-    assert newest is not None and newest.status != "not_converged"
+    assert newest is not None and newest.fit.status != "not_converged"
     # Undo, in an order of its own, down to too few.
     rows = list(range(len(data)))
     for number in np.random.default_rng(1).permutation(len(data)).tolist()[:-1]:
@@ -200,7 +217,7 @@ def test_the_cases_are_what_they_are_called() -> None:
     assert rejected(estimates["robust, base unknown"])
     assert estimates["discrepancy"].noise.discrepancy > SIGMA / 2
     assert estimates["repetitions"].noise.repeat_freedom == 12 * 2 * 3
-    ranks = [e.rank for e in streamed(*cases["rank grows"]) if e is not None]
+    ranks = [e.observability.rank for e in streamed(*cases["rank grows"]) if e is not None]
     assert ranks[0] < ranks[-1] == len(cases["rank grows"][0].parameter_names)
 
 
@@ -210,11 +227,9 @@ def test_the_order_of_coming_does_not_matter() -> None:
     one = streamed(robot, data, {"sigma": SIGMA})[-1]
     other = streamed(robot, data.select(order), {"sigma": SIGMA})[-1]
     assert one is not None and other is not None
-    back = replace(
-        other,
-        residuals=other.residuals[np.argsort(order)],
-        normalised_residuals=other.normalised_residuals[np.argsort(order)],
-    )
+    rows = np.argsort(order)
+    vectors, normalised = other.residuals.vectors[rows], other.residuals.normalised[rows]
+    back = replace(other, residuals=replace(other.residuals, vectors=vectors, normalised=normalised))
     assert_same(one, back)
 
 
@@ -227,7 +242,7 @@ def test_a_wrong_measurement_undone_leaves_no_trace() -> None:
         data.joint_names, np.vstack([data.q, data.q[:1] + 0.3]), np.concatenate([data.p, data.p[5:6] + 0.4])
     )
     wrong = identify(replace(problem, data=more), before)
-    assert np.abs(wrong.values - before.values).max() > 1e-3
+    assert np.abs(wrong.fit.values - before.fit.values).max() > 1e-3
     assert_same(identify(problem, wrong), before)
 
 
@@ -254,7 +269,7 @@ def test_predicts_where_the_robot_really_is() -> None:
     estimate = streamed(robot, data, {"sigma": SIGMA, "test_poses": q})[-1]
     assert estimate is not None
     error = np.linalg.norm(estimate.calibrated.positions(q) - truth, axis=2)
-    assert np.sqrt(np.mean(error**2)) < 2 * estimate.predicted_accuracy < 1e-3
+    assert np.sqrt(np.mean(error**2)) < 2 * estimate.accuracy.overall < 1e-3
 
 
 def test_what_is_left_to_the_end_changes_no_parameter() -> None:
@@ -262,6 +277,6 @@ def test_what_is_left_to_the_end_changes_no_parameter() -> None:
     problem = IdentificationProblem(robot, data, **{**UPDATE, **settings})
     update = identify(problem)
     final = identify(replace(problem, starts=2, joint_corrections="auto"), update)
-    assert (update.starts, final.starts, final.agreeing_starts) == (0, 2, 2)
-    np.testing.assert_allclose(update.values, final.values, rtol=0, atol=TOLERANCE)
-    np.testing.assert_allclose(update.std, final.std, rtol=0, atol=TOLERANCE)
+    assert (update.diagnostics.starts, final.diagnostics.starts, final.diagnostics.agreeing_starts) == (0, 2, 2)
+    np.testing.assert_allclose(update.fit.values, final.fit.values, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(update.fit.std, final.fit.std, rtol=0, atol=TOLERANCE)

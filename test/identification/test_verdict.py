@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +11,8 @@ from cells import POSE, ROUND, SIGMA, WrongRobot, bare, placed_cell, plain_cell,
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Robot, identify, validate
-from calib_planner.identification import LEVELS, cross_validate
-from calib_planner.identification import estimate as module
+from calib_planner.identification import LEVELS, RULES, cross_validate, judged
+from calib_planner.measurements import RejectedPoint
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KUKA = Robot.load("kuka_kr270")
@@ -192,15 +190,13 @@ USUAL = {"not_validated", "predicted_and_achieved", "correlated", "nearly_depend
 
 
 def test_the_table_is_complete():
-    """Every code that the module can say is provoked below."""
-    source = Path(module.__file__).read_text()
-    said = set(re.findall(r'Reason\(\s*(?:"\w+"|level),\s*"(\w+)"', source)) | {
-        "drift",
-        "bump",
-        "reseat",
-        "distance",
-    }
-    assert said == set(PROVOKED)
+    """Every code that the verdict can give is provoked below, at every level that it can have there."""
+    assert {rule.code for rule in RULES.values()} == set(PROVOKED)
+    assert all(key.partition(": ")[0] == rule.code for key, rule in RULES.items())
+    levels = {code: {rule_level for rule in RULES.values() if rule.code == code for rule_level in rule.advice}
+              for code in PROVOKED}  # fmt: skip
+    for code, ways in PROVOKED.items():
+        assert {level for level, _ in ways} <= levels[code], code
 
 
 def problem() -> IdentificationProblem:
@@ -289,16 +285,18 @@ def test_of_no_noise_as_much_as_of_much_is_exceeded_by_chance_once_in_forty():
 def test_levels_of_shares_and_ratios_are_where_they_are_said_to_be():
     """On a made-up estimate: 5 and 20 % rejected, 1.5 and 3 times what was predicted."""
     base = validated()
-    point = {"row": 0, "target": 1, "reason": "", "normalised_residual": 9.0, "residual": 0.1}
+    point = RejectedPoint(0, 1, "", 9.0, 0.1)
     for rejected, measurements, level in (
         (1, 20, "PASS"),
         (6, 100, "WARN"),
         (20, 100, "WARN"),
         (21, 100, "FAIL"),
     ):
-        made = replace(base, rejected=(point,) * rejected, measurements=measurements)
+        made = judged(
+            replace(base, points=replace(base.points, rejected=(point,) * rejected, measured=measurements))
+        )
         assert next(r for r in made.verdict.reasons if r.code == "rejected").level == level
     for ratio, level in ((1.49, "PASS"), (1.51, "WARN"), (2.99, "WARN"), (3.01, "FAIL")):
         own = replace(base.validation, rms=ratio * 1e-4, predicted_rms=1e-4)
-        made = replace(base, validation=own)
+        made = judged(replace(base, validation=own))
         assert next(r for r in made.verdict.reasons if r.code == "predicted_and_achieved").level == level

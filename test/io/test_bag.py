@@ -84,8 +84,8 @@ def test_the_simulated_robot_is_recovered(tmp_path: Path) -> None:
     said = campaign(cell, random_configurations(robot, 14, 2), seed=4)
     found = read_bag(write_bag(tmp_path / "bag", said, plugin="MCAP"), robot)
     estimate = identify(IdentificationProblem(robot, found.data))
-    true = np.array([cell.deviations[n] for n in estimate.parameters])
-    off = (np.asarray(estimate.deviations) - true) / np.asarray(estimate.std)
+    true = np.array([cell.deviations[n] for n in estimate.fit.parameters])
+    off = (np.asarray(estimate.fit.deviations) - true) / np.asarray(estimate.fit.std)
     assert np.abs(off).max() < 5 and np.abs(true).max() > 1e-4
     expected = cell.sigma / np.sqrt(np.array([s.samples for s in found.standstills]))
     np.testing.assert_allclose(np.asarray(found.data.std)[:, :, 0], expected, rtol=0.15)

@@ -16,6 +16,7 @@ from calib_planner import Plan
 from calib_planner.acquisition import Reason, Rejection, Standstill
 from calib_planner.errors import FileFormatError, InputError, StoreError
 from calib_planner.io import LONGEST, CampaignStore, StoredModel, UnavailableStore, stored_model
+from calib_planner.io import store as store_file
 from calib_planner.io.store import FILE, MIGRATIONS
 
 MOVED = Rejection(3, 4, Reason.MOVED, "moved", np.full(2, np.nan), np.array([3, 0]))
@@ -224,10 +225,9 @@ def test_an_older_schema_is_brought_up_to_date(tmp_path: Path, monkeypatch: pyte
     store = opened(tmp_path)
     store.record(begun(store), decision(standstill(1)))
     store.close()
-    from calib_planner.io import campaign_schema
 
     more = (*MIGRATIONS, "ALTER TABLE standstills ADD COLUMN note TEXT;")
-    monkeypatch.setattr(campaign_schema, "MIGRATIONS", more)
+    monkeypatch.setattr(store_file, "MIGRATIONS", more)
     store = opened(tmp_path)
     found = store.current()
     assert found is not None and len(found.decisions) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import subprocess
 import sys
 import textwrap
@@ -113,34 +114,43 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path, folder: str) -> None:
 
 # ── kill -9 ──────────────────────────────────────────────────────────────────────────────────────────
 
-WRITER = """
-    import sys
+WRITERS = """
+    import os, sys
     from dataclasses import replace
     from stores import *
-    from calib_planner.errors import StoreError
-    store = opened(sys.argv[1])
-    found = store.current() or store.begin("p", None)
-    state = {d.number: d.status for d in found.decisions}
-    print("open", *(f"{n}:{s}" for n, s in state.items()), flush=True)
-    k = len(state)
-    while True:
-        k += 1
-        d = decision(standstill(k))
-        number = store.record(found.number, d)
-        print(f"{number}:accepted", flush=True)
-        if k % 3 == 0:
-            store.decide(found.number, [replace(d, number=number).now("undone", "")])
-            print(f"{number}:undone", flush=True)
+
+    def write():
+        store = opened(sys.argv[1])
+        found = store.current() or store.begin("p", None)
+        state = {d.number: d.status for d in found.decisions}
+        print(os.getpid(), *(f"{n}:{s}" for n, s in state.items()), flush=True)
+        k = len(state)
+        while True:
+            k += 1
+            d = decision(standstill(k))
+            number = store.record(found.number, d)
+            print(f"{number}:accepted", flush=True)
+            if k % 3 == 0:
+                store.decide(found.number, [replace(d, number=number).now("undone", "")])
+                print(f"{number}:undone", flush=True)
+
+    for _ in range(8):
+        child = os.fork()
+        if child == 0:
+            write()
+        os.waitpid(child, 0)
+        print("killed", flush=True)
 """
+"""Eight processes, one after the other, that write until somebody kills them; the imports are made once."""
 
 
 def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
     rng = random.Random(7)
     told: dict[int, str] = {}
-    for _ in range(8):
-        with run_script(WRITER, tmp_path) as process:
-            assert process.stdout is not None
-            first = process.stdout.readline().split()[1:]
+    with run_script(WRITERS, tmp_path) as process:
+        assert process.stdout is not None
+        for _ in range(8):
+            writer, *first = process.stdout.readline().split()
             restored = {int(n): s for n, s in (word.split(":") for word in first)}
             # At most the one step under way at the kill was committed without having been told.
             news = set(restored.items()) - set(told.items())
@@ -150,10 +160,9 @@ def test_nothing_acknowledged_is_lost_by_kill_9(tmp_path: Path) -> None:
             for _ in range(rng.randrange(1, 40)):
                 number, status = process.stdout.readline().strip().split(":")
                 told[int(number)] = status
-            process.kill()
-            for line in process.stdout:
-                if line.endswith("\n"):
-                    told[int(line.split(":")[0])] = line.strip().split(":")[1]
+            os.kill(int(writer), signal.SIGKILL)
+            while (line := process.stdout.readline()) != "killed\n":
+                told[int(line.split(":")[0])] = line.strip().split(":")[1]
     assert len(told) > 30
     store = opened(tmp_path)
     found = store.current()

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import json
 import re
+import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -374,6 +375,25 @@ def test_bad_input_before_any_work(
     assert main(["reproduce", *(w.format(file=file) for w in words)]) == 2
     error = capsys.readouterr().err
     assert needle in error and error.count("\n") == 1
+
+
+def test_without_the_paper_the_command_says_what_to_install() -> None:
+    """``calib_planner_paper`` is a package of its own: every other command does without it."""
+    script = """
+import sys
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name == "calib_planner_paper":
+            raise ModuleNotFoundError("blocked", name=name)
+sys.meta_path.insert(0, Block())
+from calib_planner.cli import main
+assert main(["robots", "list"]) == 0
+raise SystemExit(main(["reproduce"]))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.count("\n") == 1 and "calib_planner_paper is not installed" in done.stderr
+    assert "pip install" in done.stderr and "paper/" in done.stderr
 
 
 def test_a_figure_that_cannot_be_written(result: Reproduction, tmp_path: Path, monkeypatch: Any) -> None:

@@ -50,7 +50,7 @@ def test_predicted_accuracy_is_equation_14():
 
 
 def test_same_seed_same_plan():
-    problem = PlanProblem(kuka(), TEST_POSE, 4, search=Search(starts=8, seed=11))
+    problem = PlanProblem(Robot.load("planar_2r"), [0.2, 0.9], 4, search=Search(starts=8, seed=11))
     first, second = plan(problem), plan(problem)
     np.testing.assert_array_equal(first.configurations, second.configurations)
     other = plan(dataclasses.replace(problem, search=Search(starts=8, seed=12)))
@@ -97,7 +97,7 @@ def test_unknown_base_and_tool_can_be_planned_for():
 
 
 def test_plan_is_immutable_and_plain():
-    found = plan(PlanProblem(kuka(), TEST_POSE, 3, search=Search(starts=4)))
+    found = plan(PlanProblem(Robot.load("planar_2r"), [0.2, 0.9], 3, search=Search(starts=4)))
     with pytest.raises(dataclasses.FrozenInstanceError):
         found.quality.seed = 3
     with pytest.raises(ValueError, match="read-only"):

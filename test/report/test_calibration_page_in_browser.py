@@ -73,7 +73,7 @@ def test_it_loads_without_a_complaint_and_draws_every_point(chromium: Browser, t
         """
     )
     assert tab.problems == [] and tab.requests == [(tmp_path / "report.html").resolve().as_uri()]
-    assert seen["points"] == int(problem.data.seen.sum()) and seen["arrows"] >= estimate.used
+    assert seen["points"] == int(problem.data.seen.sum()) and seen["arrows"] >= estimate.points.used
     assert seen["inked"] > 2000 and seen["still"] == "none" and seen["images"] == 1
 
 
@@ -95,7 +95,7 @@ def test_the_numbers_on_the_screen_are_those_of_the_json(chromium: Browser, page
           wrong: shown.filter((d) => Number(d.value) !== held(d.dataset.key)).map((d) => d.dataset.key) };
         """
     )
-    assert seen["count"] > 80 and seen["wrong"] == [] and seen["mean"] == case[1].residual_after.mean
+    assert seen["count"] > 80 and seen["wrong"] == [] and seen["mean"] == case[1].residuals.after.mean
 
 
 def test_mouse_and_keys_turn_zoom_and_reset(chromium: Browser, page: Path) -> None:
@@ -170,7 +170,7 @@ def test_sliders_choose_robot_and_magnification(chromium: Browser, page: Path, c
     tab.run(slide.format("magnify-3d", 2))
     assert picture(tab) != moved and tab.run(words)[1] == "5"
     tab.run(slide.format("robot-3d", 10))
-    length = 1e3 * np.linalg.norm(case[1].residuals[10, 0])
+    length = 1e3 * np.linalg.norm(case[1].residuals.vectors[10, 0])
     readout = tab.run(words)[2]
     assert f"{length:.4f} mm after" in readout and "rejected" not in readout
     tab.run('document.querySelector("[name=when-3d][value=before]").click();')
@@ -221,15 +221,15 @@ def test_the_parameter_table_sorts_by_exact_values(chromium: Browser, page: Path
     table = 'const t = document.getElementById("parameter-table"), head = t.tHead.rows[0].cells;'
     names = "return Array.from(t.tBodies[0].rows, (row) => row.cells[0].textContent);"
     estimate = case[1]
-    known = [(s, n) for s, n in zip(estimate.std, estimate.parameters, strict=True) if np.isfinite(s)]
+    known = [(s, n) for s, n in zip(estimate.fit.std, estimate.fit.parameters, strict=True) if np.isfinite(s)]
     ascending = [n for _, n in sorted(known)]
-    assert tab.run(table + names) == list(estimate.parameters)
+    assert tab.run(table + names) == list(estimate.fit.parameters)
     assert tab.run(table + "head[5].click();" + names)[: len(known)] == ascending
     assert tab.run(table + 'return head[5].getAttribute("aria-sort");') == "ascending"
     tab.run(table + "head[5].focus();")
     tab.key("Enter")
     assert [n for n in tab.run(table + names) if n in ascending] == ascending[::-1]
-    assert tab.run(table + "head[0].click();" + names) == list(estimate.parameters)
+    assert tab.run(table + "head[0].click();" + names) == list(estimate.fit.parameters)
 
 
 @pytest.mark.parametrize("width", [360, 768, 1280])

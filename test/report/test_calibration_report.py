@@ -102,7 +102,7 @@ def test_the_numbers_are_those_of_the_estimate(case: Case) -> None:
     problem, estimate = case
     page = Page(report_page(calibration_report(problem, estimate)))
     assert page.json["estimate"] == json.loads(json.dumps(estimate.to_dict(), allow_nan=False))
-    assert len(page.numbers) > 5 * len(estimate.parameters) - 5 * len(estimate.held)
+    assert len(page.numbers) > 5 * len(estimate.fit.parameters) - 5 * len(estimate.observability.fixed)
     for values, text in page.numbers:
         exact = at(page.json, values["data-key"])
         assert float(values["value"]) == exact, values
@@ -115,15 +115,15 @@ def test_the_most_important_numbers_are_there(case: Case) -> None:
     page = Page(report_page(calibration_report(problem, estimate)))
     keys = {values["data-key"] for values, _ in page.numbers}
     wanted = {"estimate.residual_before.mean", "estimate.residual_after.mean", "estimate.rank", "estimate.used"}
-    for i, name in enumerate(estimate.parameters):
-        if name not in estimate.held and np.isfinite(estimate.std[i]):
+    for i, name in enumerate(estimate.fit.parameters):
+        if name not in estimate.observability.fixed and np.isfinite(estimate.fit.std[i]):
             wanted |= {f"estimate.parameters.{i}.{k}" for k in ("nominal", "value", "deviation", "std")}
-    wanted |= {f"estimate.rejected.{i}.residual" for i in range(len(estimate.rejected))}
+    wanted |= {f"estimate.rejected.{i}.residual" for i in range(len(estimate.points.rejected))}
     for name in ("validation", "cross_validation"):
         if getattr(estimate, name) is not None:
             wanted |= {f"estimate.{name}.{k}" for k in ("before_mean", "mean", "rms", "max", "predicted_rms")}
     assert wanted <= keys
-    if estimate.required_accuracy > 0:
+    if estimate.accuracy.required > 0:
         assert "required_accuracy" in keys
 
 
@@ -131,11 +131,11 @@ def test_distances_before_are_those_of_the_estimate(case: Case) -> None:
     problem, estimate = case
     report = calibration_report(problem, estimate)
     used = problem.data.seen.copy()
-    for point in estimate.rejected:
-        used[point["row"], point["target"] - 1] = False
+    for point in estimate.points.rejected:
+        used[point.row, point.target - 1] = False
     before = np.linalg.norm(report.before, axis=2)[used]
-    np.testing.assert_allclose(before.mean(), estimate.residual_before.mean, rtol=1e-6)
-    np.testing.assert_allclose(before.max(), estimate.residual_before.max, rtol=1e-6)
+    np.testing.assert_allclose(before.mean(), estimate.residuals.before.mean, rtol=1e-6)
+    np.testing.assert_allclose(before.max(), estimate.residuals.before.max, rtol=1e-6)
 
 
 def test_the_verdict_comes_first_with_every_reason(case: Case) -> None:
@@ -152,10 +152,10 @@ def test_the_verdict_comes_first_with_every_reason(case: Case) -> None:
 
 def test_what_was_rejected_is_listed_with_its_reason() -> None:
     problem, estimate = outliers()
-    assert {p["row"] for p in estimate.rejected} == {0, 3, 6}
+    assert {p.row for p in estimate.points.rejected} == {0, 3, 6}
     page = Page(report_page(calibration_report(problem, estimate)))
-    for point in estimate.rejected:
-        assert point["reason"] in page.text["rejected"]
+    for point in estimate.points.rejected:
+        assert point.reason in page.text["rejected"]
     assert "Nothing: all 32 points" in " ".join(
         Page(report_page(calibration_report(*clean()))).text["rejected"].split()
     )
@@ -163,11 +163,13 @@ def test_what_was_rejected_is_listed_with_its_reason() -> None:
 
 def test_fixed_parameters_and_correlated_pairs_are_named() -> None:
     problem, estimate = kuka(12, unknown=("base",), share=0.1)
-    assert estimate.held and estimate.correlations
+    assert estimate.observability.fixed and estimate.fit.correlations
     text = " ".join(Page(report_page(calibration_report(problem, estimate))).text["parameters"].split())
-    for name, combination in zip(estimate.held, estimate.unidentifiable, strict=True):
+    for name, combination in zip(
+        estimate.observability.fixed, estimate.observability.unidentifiable, strict=True
+    ):
         assert f"{name} " in text and f"the data cannot show it: {combination}" in text
-    for a, b, _ in estimate.correlations:
+    for a, b, _ in estimate.fit.correlations:
         assert f"{a}, {b}" in text
 
 
@@ -210,8 +212,8 @@ def test_many_rows_thin_the_drawing_and_say_so_but_never_the_numbers() -> None:
     page = Page(report_page(report))
     assert len(page.json["distances_after"]) == len(page.json["scene"]["points"]) == 1500
     assert len(page.json["scene"]["robot_rows"]) <= MOST_ROBOTS and len(drawn_points(report).rows) <= MOST_DOTS
-    assert {p["row"] for p in estimate.rejected} <= set(page.json["scene"]["robot_rows"])
-    assert {p["row"] for p in estimate.rejected} <= set(drawn_points(report).rows.tolist())
+    assert {p.row for p in estimate.points.rejected} <= set(page.json["scene"]["robot_rows"])
+    assert {p.row for p in estimate.points.rejected} <= set(drawn_points(report).rows.tolist())
     assert f"draw {MOST_DOTS} of 1500 points" in page.text["residuals"]
     assert f"robot at {MOST_ROBOTS} of 1500 rows" in page.text["view"]
 
@@ -249,7 +251,7 @@ def test_the_scene_is_in_the_axes_of_the_base() -> None:
     apart = scene.points - here  # q1 and base.rz look alike: only a turn about z and a small shift are free
     assert np.linalg.norm(apart[good], axis=1).max() < 0.02
     assert scene.tracker == pytest.approx(turn.T @ -place, abs=0.02)
-    lengths = np.linalg.norm(estimate.residuals[problem.data.seen], axis=1)
+    lengths = np.linalg.norm(estimate.residuals.vectors[problem.data.seen], axis=1)
     np.testing.assert_allclose(np.linalg.norm(scene.after, axis=1), lengths, rtol=1e-9)
     # Model and skeleton end in the same place, and measured = model + residual.
     ends = scene.robots[:, -1]
@@ -274,7 +276,7 @@ def test_residuals_by_joint_are_seen_in_the_joints_axes() -> None:
     pushed = points + 1e-3 * along + [0, 0, 2e-3]
     problem = IdentificationProblem(robot, Measurements(robot.joint_names, q, pushed), joint_corrections="off")
     estimate = identify(problem)
-    estimate = replace(estimate, residuals=pushed - points)
+    estimate = replace(estimate, residuals=replace(estimate.residuals, vectors=pushed - points))
     found = joint_residuals(calibration_report(problem, estimate))[1]
     levers = robot.joint_jacobian(q).reshape(30, 3, 2)[..., 1]
     assert np.linalg.norm(levers, axis=1).min() > 0.5

@@ -26,8 +26,8 @@ def result() -> DemoResult:
     data = SimulatedCell(robot, truth, problem.instrument.typical).measure(made.configurations, 1, 2)
     estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
     with pytest.raises(InputError, match="estimate"):
-        demo_report(PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6), made, estimate, truth)
-    return demo_report(problem, made, estimate, truth, report="here")
+        demo_report(PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6), made, estimate.fit, truth)
+    return demo_report(problem, made, estimate.fit, truth, report="here")
 
 
 def test_numbers(result: DemoResult) -> None:

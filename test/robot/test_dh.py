@@ -243,8 +243,10 @@ def test_parallel_axes_hide_their_d_and_the_twist_between_them(tmp_path):
     cell = SimulatedCell(robot, {"j2.d": 1e-3, "j3.d": 5e-4, "j2.a": 1e-3}, 1e-5)
     asked = robot.with_parameters("j2.d,j3.d,j2.a")
     found = identify(IdentificationProblem(asked, cell.measure(q, 1, 0), sigma=1e-5))
-    assert len(found.held) == 1 and "j3.d" in str(found.held) + str(found.to_dict()["unidentifiable"])
-    values = dict(zip(found.parameters, found.deviations, strict=True))
+    assert len(found.observability.fixed) == 1 and "j3.d" in str(found.observability.fixed) + str(
+        found.to_dict()["unidentifiable"]
+    )
+    values = dict(zip(found.fit.parameters, found.fit.deviations, strict=True))
     assert values["j2.d"] + values["j3.d"] == pytest.approx(1.5e-3, abs=2e-5)
 
 
@@ -268,16 +270,16 @@ REFUSED = {
     "no chain": (HEAD, "exactly one of: elements, dh, modified_dh, got no chain"),
     "a list": (HEAD + "dh: [{joint: q1}]", "a mapping with keys rows, length_unit, angle_unit"),
     "no rows": (HEAD + "dh: {rows: []}", "at least one entry"),
-    "no joint": (HEAD + "dh: {rows: [{a: 1}]}", "dh.rows[0]: expected 'joint' to be given"),
+    "no joint": (HEAD + "dh: {rows: [{a: 1}]}", "dh.rows[0].joint: expected this key"),
     "unknown joint": (DH.replace("joint: q1", "joint: q7"), "dh.rows[0].joint: expected one of: q1"),
     "joint without row": (DH.replace("joint: q1", "joint: q7, type: fixed"), "one row for every joint"),
     "twice": (DH.replace("[{joint: q1, a: 1}]", "[{joint: q1}, {joint: q1}]"), "this name twice"),
-    "unknown key": (DH.replace("a: 1", "length: 1"), "unknown key 'length'"),
+    "unknown key": (DH.replace("a: 1", "length: 1"), "dh.rows[0].length: expected only: joint, type"),
     "unknown type": (DH.replace("a: 1", "type: helical"), "one of: revolute, prismatic, fixed"),
     "unknown unit": (DH.replace("{rows", "{angle_unit: grad, rows"), "dh.angle_unit: expected one of: rad, deg"),
     "wrong kind of unit": (DH.replace("{rows", "{length_unit: deg, rows"), "one of: m, mm"),
     "not a number": (DH.replace("a: 1", "alpha: pi/2"), "dh.rows[0].alpha: expected a finite number"),
-    "YAML's idea of a number": (DH.replace("a: 1", "a: 1e-3"), "write 1.0e-3 instead of 1e-3"),
+    "a number in quotes": (DH.replace("a: 1", "a: '1e-3'"), "in quotes is text"),
     "sign": (DH.replace("a: 1", "sign: 2"), "dh.rows[0].sign: expected +1 or -1"),
     "sign of a fixed row": (DH.replace("a: 1}", "a: 1}, {joint: f, type: fixed, sign: -1}"), "type is fixed"),
     "fixed row of a joint": (DH.replace("a: 1", "type: fixed"), "neither, in a row whose type is fixed"),
@@ -290,6 +292,13 @@ REFUSED = {
     "levels as a list": (DH + "levels: [q1.a]", "levels: expected a mapping"),
     "name twice in a list": (DH + "lengths: [q1.a, q1.a]", "each name once"),
 }
+
+
+def test_numbers_are_those_of_yaml_1_2(tmp_path):
+    for text in ("1e-3", "+1.e-3", ".1e-2", "1E-3", "1.0e-3", "0.001"):
+        (tmp_path / "robot.yaml").write_text(DH.replace("a: 1", f"a: {text}"))
+        robot = Robot.load(tmp_path / "robot.yaml")
+        assert {p.name: p.nominal for p in robot.with_parameters(["q1.a"]).parameters} == {"q1.a": 1e-3}
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -308,7 +317,7 @@ def test_a_small_file_cannot_make_a_huge_error(tmp_path):
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
     path = tmp_path / "robot.yaml"
     path.write_text("\n".join(lines))
-    with pytest.raises(FileFormatError, match="unknown key 'a0'"):
+    with pytest.raises(FileFormatError, match="alias"):
         Robot.load(path)
     nested = "\n  ".join(lines)
     path.write_text(f"description:\n  {nested}\n{HEAD}dh: {{rows: [{{joint: q1, type: *a11}}]}}\n")

@@ -135,7 +135,7 @@ def test_what_a_level_frees_is_found(tmp_path, file, request_, unknown, targets)
     cell = SimulatedCell(robot, random_deviations(robot, seed=4), SIGMA)
     data = cell.measure(random_configurations(robot, 40, 1), 1, seed=2)
     found = identify(IdentificationProblem(robot, data, sigma=SIGMA))
-    assert found.parameters == robot.parameter_names
+    assert found.fit.parameters == robot.parameter_names
     fresh = random_configurations(robot, 300, 3)
     before, after = (np.sqrt(np.mean(cell.position_errors(r, fresh) ** 2)) for r in (robot, found.calibrated))
     # p parameters from 120 equations per target leave σ √(3p / (120 targets)) at poses like the measured ones.

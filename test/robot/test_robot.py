@@ -112,7 +112,7 @@ YAML_HEAD = "joints: [{name: q1, lower: -1, upper: 1}]\nelements: [{type: Rz, jo
     ("text", "needle"),
     [
         ("joints: [", "readable YAML"),
-        ("3", "a mapping with keys"),
+        ("3", "document: expected readable YAML of a robot"),
         ("joints: []\nelements: []", "at least one entry"),
         ("elements: [{type: Rz}]", "no key 'joints'"),
         (YAML_HEAD + "lenghts: [a]", "unknown key 'lenghts'"),
@@ -121,7 +121,7 @@ YAML_HEAD = "joints: [{name: q1, lower: -1, upper: 1}]\nelements: [{type: Rz, jo
         (YAML_HEAD.replace("upper: 1", "upper: -2"), "lower < upper"),
         (YAML_HEAD.replace("upper: 1", "upper: .nan"), "a finite number"),
         (YAML_HEAD.replace("upper: 1", "upper: 1, unit: turn"), "rad, deg"),
-        (YAML_HEAD + "targets: [[1, 2]]", "three numbers"),
+        (YAML_HEAD + "targets: [[1, 2]]", "a list of 3 numbers"),
         (YAML_HEAD + "lengths: [l9]", "only: "),
         (YAML_HEAD.replace("elements: [", "elements: [{type: Rx, joint: q1}, "), "exactly one element"),
         ("!!python/object/apply:os.system ['true']", "readable YAML"),

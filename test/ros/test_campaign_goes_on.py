@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from operator import attrgetter
 from pathlib import Path
 from typing import TextIO
 
@@ -72,9 +73,9 @@ def measure(campaign: Campaign, *founds: Standstill) -> list[str]:
 
 def assert_same_estimate(a: object, b: object) -> None:
     assert isinstance(a, Estimate) and isinstance(b, Estimate)
-    for name in ("values", "deviations", "covariance", "residuals"):
-        assert np.allclose(getattr(a, name), getattr(b, name), rtol=0, atol=1e-12, equal_nan=True), name
-    assert a.rejected == b.rejected and a.verdict == b.verdict
+    for name in ("fit.values", "fit.deviations", "fit.covariance", "residuals.vectors"):
+        assert np.allclose(attrgetter(name)(a), attrgetter(name)(b), rtol=0, atol=1e-12, equal_nan=True), name
+    assert a.points.rejected == b.points.rejected and a.verdict == b.verdict
 
 
 # ── outliers ─────────────────────────────────────────────────────────────────────────────────────────
@@ -101,7 +102,7 @@ def test_the_estimate_does_not_see_the_outlier() -> None:
     measure(dirty, *(seen(k, 1e-2 if k == 4 else 0.0) for k in rows))
     a, b = clean.newest, dirty.newest
     assert isinstance(a, Estimate) and isinstance(b, Estimate)
-    assert np.allclose(a.values, b.values, rtol=0, atol=1e-9) and a.used == b.used == 9
+    assert np.allclose(a.fit.values, b.fit.values, rtol=0, atol=1e-9) and a.points.used == b.points.used == 9
     assert condition_of(a) == pytest.approx(condition_of(b), rel=1e-3) and condition_of(a) > 1
 
 
@@ -158,7 +159,7 @@ def test_the_way_does_not_matter() -> None:
     for row in (3, 5):
         detour.undo(next(d.number for d in detour.kept if d.index == row))
     a, b = straight.estimate(HOW), detour.estimate(HOW)
-    assert isinstance(a, Estimate) and isinstance(b, Estimate) and np.array_equal(a.values, b.values)
+    assert isinstance(a, Estimate) and isinstance(b, Estimate) and np.array_equal(a.fit.values, b.fit.values)
 
 
 def test_a_plan_that_comes_back() -> None:

@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from calib_planner import IdentificationProblem, Plan, PlanProblem, Robot, identify, plan
 from calib_planner.acquisition import Reason, Rejection, Standstill
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.identification.estimate import STATUS as LIBRARY_ESTIMATE_STATUS
+from calib_planner.identification import STATUS as LIBRARY_ESTIMATE_STATUS
 from calib_planner.planning import Search
 from calib_planner.planning.result import STATUS as LIBRARY_PLAN_STATUS
 from calib_planner.ros import messages as c
@@ -167,9 +167,9 @@ def test_estimate_there_and_back(robot: Robot, planned: Plan) -> None:
     assert message.status == CalibrationEstimate.STATUS_OK and message.complete
     assert len(message.covariance) == len(message.parameters) ** 2
     back = c.estimate_from_message(message)
-    assert back.parameters == found.parameters
+    assert back.parameters == found.fit.parameters
     for name in ("nominal", "deviations", "std"):
-        assert np.array_equal(getattr(back, name), getattr(found, name))
+        assert np.array_equal(getattr(back, name), getattr(found.fit, name))
     message.std = message.std[:-1]
     with pytest.raises(InputError, match="std"):
         c.estimate_from_message(message)
@@ -179,5 +179,9 @@ def test_an_estimate_with_infinite_accuracy_travels(robot: Robot, planned: Plan)
     cell = SimulatedCell(robot, {})
     data = cell.measure(planned.configurations, 1, 1)
     found = identify(IdentificationProblem(robot, data, test_poses=planned.configurations[:1]))
-    blind = replace(found, std=np.full(4, np.nan), parameter_accuracy_per_test_pose=np.array([np.inf]))
+    blind = replace(
+        found,
+        fit=replace(found.fit, std=np.full(4, np.nan)),
+        accuracy=replace(found.accuracy, parameters=np.array([np.inf])),
+    )
     assert math.isinf(c.estimate_to_message(blind).predicted_accuracy[0])

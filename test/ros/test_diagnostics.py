@@ -48,9 +48,9 @@ def test_a_good_campaign() -> None:
     assert np.allclose(q, PLAN.configurations[8], atol=1e-4)
     shown, estimate = values(found["estimate"]), campaign.newest
     assert isinstance(estimate, Estimate)
-    assert shown["rank"] == str(estimate.rank) and shown["outliers"] == "1"
+    assert shown["rank"] == str(estimate.observability.rank) and shown["outliers"] == "1"
     assert float(shown["condition"]) >= 1 and shown["verdict"] == estimate.verdict.level
-    assert float(shown["residual rms [m]"]) == pytest.approx(estimate.residual_after.rms, rel=1e-2)
+    assert float(shown["residual rms [m]"]) == pytest.approx(estimate.residuals.after.rms, rel=1e-2)
     measure(campaign, *(seen(k) for k in range(8, 12)))
     assert values(said(campaign)["campaign"])["complete"] == "True"
 

@@ -93,6 +93,7 @@ class Value(Recorded):
 
 
 def load(path: Path) -> Any:
+    sys.modules.pop("calib_planner.ros.launching", None)  # it is made of launch, or of what stands in for it
     spec = importlib.util.spec_from_file_location("launched", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -159,7 +160,9 @@ def test_nodes_are_ours_with_parameters_they_have(path: Path, stand_ins: None) -
     for executable, node in ours.items():
         part = executable.removesuffix("_node")
         assert node.named["name"] == NODES[part][0]
+        assert importlib.util.find_spec(f"calib_planner.ros.nodes.{part}")
         known = {f.name for f in fields(NODES[part][1])} | {"use_sim_time"}
+        assert (config_folder() / f"{part}.yaml").is_file()
         for parameters in node.named["parameters"]:
             assert not isinstance(parameters, dict) or set(parameters) <= known
 

@@ -77,7 +77,7 @@ def test_from_too_few_to_complete(robot: Robot, planned: Plan, campaign: Campaig
         assert (decision.status, decision.index, decision.repetition) == ("accepted", i, 0)
     assert campaign.complete
     found = campaign.estimate(HOW)
-    assert isinstance(found, Estimate) and len(found.predicted_accuracy_per_test_pose) == 1
+    assert isinstance(found, Estimate) and len(found.accuracy.predicted) == 1
     again = campaign.take(standstill(robot, planned.configurations[2], 9), HOW)
     assert (again.index, again.repetition) == (2, 1)
 
@@ -172,5 +172,5 @@ def test_a_simulated_shift_gives_the_truth(robot: Robot, planned: Plan, campaign
         campaign.take(one, HOW)  # type: ignore[arg-type]
     estimate = campaign.estimate(HOW)
     assert campaign.complete and isinstance(estimate, Estimate)
-    off = estimate.deviations - [truth[n] for n in estimate.parameters]
-    assert (np.abs(off) < 4 * estimate.std).all()
+    off = estimate.fit.deviations - [truth[n] for n in estimate.fit.parameters]
+    assert (np.abs(off) < 4 * estimate.fit.std).all()

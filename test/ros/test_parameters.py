@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.io import config_folder
 from calib_planner.ros import settings as parameter_yaml
+from calib_planner.ros.model import load_shipped
 from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.planner import PlannerNode
@@ -29,7 +30,6 @@ from calib_planner.ros.settings import (
     IdentifierParameters,
     PlannerParameters,
     SimulatorParameters,
-    load_shipped,
 )
 
 NODES = [

@@ -198,7 +198,7 @@ def test_the_robot_comes_over_the_wire(bench: Bench) -> None:
 
 def test_a_bad_description_changes_nothing_after_a_good_one(bench: Bench) -> None:
     node = bench.start(PlannerNode, robot="planar_2r", starts=4)
-    publish(bench, urdf(3), lambda: isinstance(node._source.model, Model) and node._source.model.described)
+    publish(bench, urdf(3), lambda: isinstance(node._source.model, Model) and node._source.model.robot.from_urdf)
     source, refused = node._source, []
     take = source.take
 

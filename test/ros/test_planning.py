@@ -192,7 +192,7 @@ def urdf(joints: int, *, inside: str = "", limit: str = 'velocity="2.0"') -> str
 
 def test_a_described_robot_is_planned_for() -> None:
     model = described_model(urdf(3))
-    assert model.described and model.speeds.tolist() == [2.0] * 3
+    assert model.robot.from_urdf and model.speeds.tolist() == [2.0] * 3
     found = answer(PlanCalibration.Request(test_poses=[0.1, 0.2, 0.3]), SETTINGS, model)
     assert found.status == "SUCCESS" and found.plan is not None and found.plan.joint_names == ("j0", "j1", "j2")
     assert np.isinf(described_model(urdf(3, limit="")).speeds).all()

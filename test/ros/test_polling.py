@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from calib_planner.acquisition import NANO
 from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
 from calib_planner.ros.messages import nanoseconds, point_message
+from calib_planner.ros.qos import STREAM_IN
 from calib_planner.ros.rclpy_ext.polling import EVENTS_EVERY, MOST_AT_ONCE, Stream, StreamPoller
 
 DEEP = QoSProfile(depth=4000, reliability=ReliabilityPolicy.RELIABLE)
@@ -28,7 +29,7 @@ class Listener(ManagedNode[LifecycleParameters]):
 
     def configure(self) -> None:
         streams = [Stream(PointStamped, t, functools.partial(self._note, t), lambda _: None) for t in ("a", "b")]
-        self.poller = StreamPoller(self, streams)
+        self.poller = StreamPoller(self, streams, STREAM_IN)
 
     def _note(self, topic: str, message: PointStamped) -> None:
         if message.point.x < 0:

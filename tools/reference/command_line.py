@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from markdown import MADE, escaped, joined
 
-from calib_planner.cli.main import EPILOG, parser
+from calib_planner.cli import EPILOG, parser
 
 INTRODUCTION = """\
 What `calib-planner COMMAND --help` says, with all commands on one page. Square brackets hold units; a value in

@@ -11,7 +11,8 @@ from markdown import MADE, code, escaped, joined, table
 INTRODUCTION = """\
 Every parameter of every node, as declared in `calib_planner/ros/settings.py`. A node refuses names that it does
 not know and values of another type or out of range, at start as later, and says what would be valid. The same,
-ready to be edited: `config/planner.yaml`, `config/identifier.yaml`, `config/simulator.yaml`.
+ready to be edited: `config/planner.yaml`, `config/identifier.yaml`, `config/simulator.yaml`,
+`config/campaign.yaml`.
 
 ```text
 source env.sh
@@ -59,9 +60,11 @@ def _range(item: Field[Any]) -> Iterator[str]:
 
 
 def _meaning(item: Field[Any]) -> str:
+    from calib_planner.ros.parameters import taken_at_configure
+
     words = [escaped(item.metadata["description"])]
-    if item.metadata["read_only"]:
+    if item.metadata.get("read_only"):
         words.append("*fixed*")
-    if item.metadata.get("at_configure"):
+    if taken_at_configure(item):
         words.append("*taken at configure*")
     return "; ".join(words)

@@ -91,7 +91,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         """Load the robot, offer services, listen."""
         chosen = self.settings.value
         self._forget()
-        self._source = ModelSource(chosen)  # type: ignore[arg-type]
+        self._source = ModelSource(chosen)
         self._status = self.create_publisher(CampaignStatus, "~/status", LATCHED)
         self._estimates = self.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
         self._measuring = Measuring(self, self.create_publisher(PlanMessage, "~/plan", LATCHED))

@@ -36,7 +36,7 @@ from calib_planner.ros.messages import (
     stamp_message,
 )
 from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.qos import EVENTS, LATCHED, STREAM_IN
 from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.session import Campaign, Matching, TooFew, condition_of
@@ -150,7 +150,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         for k, topic in enumerate(chosen.tracker_topics):
             hear, lost = partial(self._on_point, k), partial(self._on_lost, 1 + k)
             streams.append(Stream(PointStamped, topic, hear, lost))
-        StreamPoller(self, streams)
+        StreamPoller(self, streams, STREAM_IN)
         for name in ("reset", "undo", "save", "report"):
             self.create_service(Trigger, f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
         self.create_service(UndoMeasurement, "~/undo_measurement", self._on_undo)
@@ -159,7 +159,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         """Take what the streams say."""
         chosen = self.settings.value
         joint_names = None if self._campaign is None else self._campaign.nominal.joint_names
-        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen.standstill)
+        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen)
         self._keep_frame()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         self.create_timer(chosen.diagnostics_period, self._tick, clock=steady)

@@ -1,10 +1,17 @@
-"""Services and action servers that one thread may destroy while others use them.
+"""Services and action servers that one thread may destroy while other threads use them.
 
-A transition (``cleanup``) runs in one thread of the executor; another collects what to wait for, and a third may
-be about to answer. rclpy counts who uses a handle and destroys it after the last one. But its executor puts an
-action server into the wait set even when it could not take hold of it, its worker threads hold neither action
-servers nor, while a callback runs, services: what they then touch is gone, which ends the process or leaves
-whoever asked without an answer. Here everyone who uses a handle holds it, an answer that is owed included.
+*What rclpy does.* A transition (``cleanup``) runs in one thread of the executor while another thread collects
+what to wait for and a third is about to answer. rclpy counts the users of a handle and destroys it after the last
+one has left, but not every user is counted. The executor adds an action server to the wait set even if it could
+not enter the server's handle; worker threads enter neither the handle of an action server nor, while the callback
+runs, that of a service. They then use a handle that is gone, and ``InvalidHandle`` ends the process or leaves the
+client without an answer.
+
+*What is done here.* Every user enters the handle and leaves it, and an answer that is owed counts as a user.
+
+*Upstream.* ros2/rclpy#1385 and #1355 (open), #1284; ros2/rclpy#319 made ``destroy_*`` safe against other threads
+and left action servers out. This file may go when the executor skips a waitable that it could not enter, and when
+services and action servers stay until they have answered.
 """
 
 from __future__ import annotations
@@ -19,42 +26,39 @@ from rclpy.service import Service
 
 
 class LastingActionServer(ActionServer):
-    """See the module; otherwise as rclpy's."""
+    """An action server that stays until its last answer is sent; otherwise as rclpy's, which calls these
+    methods."""
 
     def __init__(self, node: Node, *args: Any, **named: Any) -> None:
-        self._held = False
-        # rclpy lets the executor know of the server before it gives it this.
+        self._entered = False  # whether the executor that collects now has entered the handle
+        # rclpy sets the logger after the executor has been told of the server and may already use it.
         self._logger = node.get_logger().get_child("action_server")
         super().__init__(node, *args, **named)
 
     def destroy(self) -> None:
-        """Nobody waits for it any more; it goes when the last answer is out."""
+        """Nobody waits for it any more; the handle goes with its last user."""
         self._node.remove_waitable(self)
-        for goal in list(self._goal_handles.values()):  # a copy: one may just be arriving in another thread
+        for goal in list(self._goal_handles.values()):  # a copy: another thread may be adding a goal
             goal.destroy()
         self._handle.destroy_when_not_in_use()
 
-    # ── the executor waits ───────────────────────────────────────────────────────────────────────────
-
     def __enter__(self) -> Any:
-        self._held = False
+        self._entered = False
         entered = super().__enter__()
-        self._held = True
+        self._entered = True
         return entered
 
     def add_to_wait_set(self, wait_set: Any) -> None:
-        """Called by rclpy, also when ``__enter__`` said that it is gone."""
-        if self._held:
+        """Nothing, if the handle could not be entered."""
+        if self._entered:
             super().add_to_wait_set(wait_set)
 
     def is_ready(self, wait_set: Any) -> bool:
-        """Called by rclpy."""
-        return self._held and bool(super().is_ready(wait_set))
-
-    # ── its threads work ─────────────────────────────────────────────────────────────────────────────
+        """Whether something has come; no, if the handle could not be entered."""
+        return self._entered and bool(super().is_ready(wait_set))
 
     def take_data(self) -> dict[str, Any]:
-        """Called by rclpy."""
+        """What has come; nothing, if the server is gone."""
         try:
             with self._handle:
                 return dict(super().take_data())
@@ -62,7 +66,7 @@ class LastingActionServer(ActionServer):
             return {}
 
     async def execute(self, taken_data: dict[str, Any]) -> None:
-        """Called by rclpy."""
+        """Work on what has come, unless the server is gone."""
         try:
             with self._handle:
                 await super().execute(taken_data)
@@ -79,7 +83,7 @@ class LastingActionServer(ActionServer):
     async def _execute_get_result_request(self, request_header_and_message: Any) -> None:
         _, request = request_header_and_message
         if bytes(request.goal_id.uuid) in self._goal_handles:
-            self._handle.__enter__()  # until it is sent
+            self._handle.__enter__()  # left by _send_result_response
         await super()._execute_get_result_request(request_header_and_message)
 
     def _send_result_response(self, request_header: Any, future: Any) -> None:
@@ -90,11 +94,11 @@ class LastingActionServer(ActionServer):
 
 
 def lasting(service: Service) -> Service:
-    """The service, which from now on lasts until what its callback was asked is answered."""
+    """The same service, which from now on stays until every request that it took is answered."""
     callback, handle = service.callback, service.handle
 
-    def held(request: Any, response: Any) -> Any:
-        handle.__enter__()
+    def enter_and_call(request: Any, response: Any) -> Any:
+        handle.__enter__()  # left by send
         try:
             return callback(request, response)
         except BaseException:
@@ -107,5 +111,5 @@ def lasting(service: Service) -> Service:
         finally:
             handle.__exit__(None, None, None)
 
-    service.callback, service.send_response = held, send
+    service.callback, service.send_response = enter_and_call, send
     return service

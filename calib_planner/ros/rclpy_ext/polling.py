@@ -1,11 +1,17 @@
 """Streams of thousands of messages per second: fetched a hundred times per second, in the order of their stamps.
 
-An executor of rclpy that is woken for every message spends several times what the message itself costs, and after
-the process stood still for a moment it hands out what has queued up stream by stream: two streams of different
-rates then run apart, and the slower one seems to be late. Here the subscriptions are left out of the executor's
-waiting (their callback group never lets them run), and a timer fetches all that has come since and sorts it.
-Their events (messages lost, qualities that do not match) wait with them, since every message would wake those,
-too; they get their turn now and then.
+*What rclpy does.* Its executor is woken by every message, builds a new wait set, makes a task and takes one
+message of every stream: several times the processor time of the message itself. After the process stood still for
+a moment it hands out what has queued up in turns, one message a stream: streams of different rates then run
+apart, and the slower one seems to come late.
+
+*What is done here.* The subscriptions are in a callback group that never lets them run, so that the executor does
+not wait for them; a timer fetches everything that has come since and sorts it by the stamps. The events of the
+subscriptions (messages lost, qualities of service that do not match) are in that group, too, since every message
+would wake those as well; they may run now and then.
+
+*Upstream.* ros2/rclpy#1223 and #1452 (cost per message). This file may go when an executor of rclpy hands out
+what has queued up in the order of arrival, at a cost per message that is small against the callback's.
 """
 
 from __future__ import annotations
@@ -19,30 +25,28 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.qos import STREAM_IN
-
 PERIOD = 0.01
-"""Time between two looks [s]."""
+"""Time between two looks at the streams [s]."""
 EVENTS_EVERY = 100
-"""Looks between two at which events have their turn."""
+"""The events may run after every so many looks."""
 MOST_AT_ONCE = 1000
 """Messages of one stream that are fetched at a time; the others wait in its queue for the next look."""
 
-
 Waiting = tuple[Any, Callable[[Any], None]]
-"""A message and what takes it."""
+"""A message and the callback that takes it."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """A stream to be heard.
+    """A topic to listen to.
 
     Attributes:
-        kind: Of its messages, which have a header.
-        topic: Its name.
+        kind: Type of its messages, which have a header.
+        topic: Name of the topic.
         callback: Takes a message.
         lost: Takes the number of messages that were not delivered.
     """
@@ -54,18 +58,24 @@ class Stream:
 
 
 class StreamPoller:
-    """Subscribes to streams and hands out their messages; made in ``configure`` or ``activate``.
+    """Subscribes to streams and hands out their messages.
 
     Args:
-        node: Whose subscriptions and timer they are.
-        streams: What to hear; QoS overrides apply.
+        node: Makes the subscriptions and the timer.
+        streams: The topics to listen to.
+        qos: Quality of service of the subscriptions.
     """
 
-    def __init__(self, node: ManagedNode[Any], streams: Sequence[Stream]) -> None:
+    def __init__(self, node: Node, streams: Sequence[Stream], qos: QoSProfile) -> None:
         self._looks, self._group = 0, _Unwoken()
-        self._subscriptions = [self._subscribe(node, stream, self._group) for stream in streams]
+        self._subscriptions = [self._subscribe(node, stream, qos) for stream in streams]
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         node.create_timer(PERIOD, self.poll, clock=steady)
+
+    def _subscribe(self, node: Node, stream: Stream, qos: QoSProfile) -> Subscription:
+        events = SubscriptionEventCallbacks(message_lost=lambda event: stream.lost(event.total_count_change))
+        options = {"callback_group": self._group, "event_callbacks": events}
+        return node.create_subscription(stream.kind, stream.topic, stream.callback, qos, **options)
 
     def poll(self) -> None:
         """Hand out all that has come, in the order of the stamps."""
@@ -79,23 +89,13 @@ class StreamPoller:
 
     @staticmethod
     def hand_out(waiting: list[Waiting]) -> None:
-        """Call back in the order of the stamps; an exception is logged by the node's wrapper of the callback."""
+        """Call back in the order of the stamps."""
         for message, callback in sorted(waiting, key=_stamp):
             callback(message)
 
-    @staticmethod
-    def _subscribe(node: ManagedNode[Any], stream: Stream, group: CallbackGroup) -> Subscription:
-        def lost(event: Any) -> None:
-            stream.lost(event.total_count_change)
-
-        events = SubscriptionEventCallbacks(message_lost=lost)
-        return node.create_subscription(
-            stream.kind, stream.topic, stream.callback, STREAM_IN, callback_group=group, event_callbacks=events
-        )
-
 
 class _Unwoken(CallbackGroup):
-    """Subscriptions never run, what else there is (their events) only while ``events`` is set."""
+    """Subscriptions never run; their events run only while ``events`` is set."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -122,10 +122,10 @@ def _fetched(subscription: Subscription) -> list[Any]:
     try:
         with subscription.handle:
             while len(messages) < MOST_AT_ONCE:
-                found = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if found is None:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
                     break
-                messages.append(found[0])
-    except InvalidHandle:  # it was destroyed while the timer was due
+                messages.append(taken[0])
+    except InvalidHandle:  # another thread destroyed the subscription while the timer was due
         return []
     return messages

@@ -1,4 +1,19 @@
-"""Runs one node in a process of its own: ends on Ctrl-C or SIGTERM with status 0, on a bad set-up with 1."""
+"""Runs one node in a process of its own, which ends on Ctrl-C or SIGTERM with status 0, on a bad set-up with 1.
+
+*What rclpy does.* Its signal handlers shut the context down at once, so that nobody who waits for an answer gets
+one. Without them Python's own handlers apply; these run between two steps of the main thread, which sleeps in the
+middleware, and a signal that arrives just before it goes to sleep is not seen. And where an executor has several
+threads, one may destroy a publisher (transition ``cleanup``) just when another one collects what to wait for: the
+executor then raises ``InvalidHandle``, although it works again at the next call.
+
+*What is done here.* rclpy's handlers are not installed. A thread of its own waits for signals and wakes the
+executor, which looks whether the process is to end before it sleeps again. ``InvalidHandle`` while collecting is
+passed over.
+
+*Upstream.* ros2/rclpy#844 (shutdown by a signal), #1142 and #1206 (``InvalidHandle``, open). This file may go
+when rclpy's handlers leave the context alone until the executor has returned, and when the executor passes over
+what was destroyed while it collected.
+"""
 
 from __future__ import annotations
 
@@ -23,24 +38,20 @@ from rclpy.signals import SignalHandlerOptions
 from calib_planner.errors import CalibPlannerError
 
 LAST_WORDS = 1.0
-"""Time for answers that are on their way when the process ends [s]."""
+"""Time for answers that are being sent when the process ends [s]."""
 
 
 def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = None) -> int:
-    """Make the node, spin it, clean up once.
+    """Make the node, spin it and clean up; returns the exit status.
 
     Args:
-        make: Makes the node; its ``close``, if it has one, ends what is under way and says whether it did.
+        make: Makes the node. Its ``close``, if it has one, ends what is under way and returns whether it did.
         threads: 1 for a node whose callbacks are all short: rclpy's executor of many threads costs several
             times the processor time per message.
-        args: Command line; default the process's own.
-
-    Returns:
-        Exit status.
+        args: Command line; by default that of the process.
     """
     ended = Ended()
     ended.listen()
-    # Without rclpy's handlers the context outlives the signal, and whoever waits for an answer gets one.
     words = None if args is None else list(args)
     rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     node = None
@@ -48,7 +59,10 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         if ended.done():
             return 0
         node = make()
-        ended.executor = executor = _executor(threads)
+        executor: Executor = SingleThreadedExecutor()
+        if threads > 1:
+            executor = MultiThreadedExecutor(num_threads=threads)
+        ended.executor = executor
         executor.add_node(node)
         while rclpy.ok() and not ended.done():
             spin_once(executor, ended=ended)
@@ -59,7 +73,7 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         print(f"{sys.argv[0]}: {error}", file=sys.stderr)
         return 1
     except Exception:
-        # The context may be shut down while a callback is using it: that is the end asked for, not a fault.
+        # A callback may be using the context while it is shut down: the process is ending, which is no fault.
         if ended.done() or not rclpy.ok():
             return 0
         raise
@@ -75,19 +89,14 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
 
 
 class Ended:
-    """Whether the process was told to end; a future, as far as rclpy's executors use one.
-
-    Python calls its signal handlers between two steps of the main thread, which sleeps in the middleware, and a
-    signal may arrive just before it goes to sleep. So a thread of its own waits for signals and wakes it; what it
-    wakes looks at ``done`` before it sleeps again.
-    """
+    """Whether the process was told to end; rclpy's executor, which calls these methods, takes it for a future."""
 
     def __init__(self) -> None:
         self._noted = False
         self.executor: Executor | None = None
 
     def listen(self) -> None:
-        """From now on SIGINT and SIGTERM end the process; main thread only."""
+        """From now on SIGINT and SIGTERM are noted; may be called in the main thread only."""
         self._read, self._write = socket.socketpair()
         self._write.setblocking(False)
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -103,32 +112,25 @@ class Ended:
                     self.executor.wake()
 
     def done(self) -> bool:
-        """Called by rclpy."""
+        """Whether it was told."""
         return self._noted
 
     def add_done_callback(self, callback: object) -> None:
-        """Called by rclpy at every step, to be woken; ``_wait`` does that by itself."""
+        """Nothing: ``_wait`` wakes the executor by itself."""
 
 
 NEVER = Ended()
 
 
 def spin_once(executor: Executor, timeout: float | None = None, ended: Ended = NEVER) -> None:
-    """Do what is next.
+    """Have an executor do what is next.
 
     Args:
-        executor: Whose turn it is.
-        timeout: Longest time to wait for something [s]; ``None``: any.
+        executor: The executor.
+        timeout: Longest time to wait for something to do [s]; ``None`` for no limit.
         ended: Ends the waiting.
-
-    Where there are several threads, one may destroy a publisher (transition ``cleanup``) just when another
-    collects what to wait for; rclpy's executor then raises, and is as good as new when called again.
     """
     try:
         executor.spin_once_until_future_complete(ended, timeout)
-    except InvalidHandle:
+    except InvalidHandle:  # something was destroyed while the executor collected what to wait for
         return
-
-
-def _executor(threads: int) -> Executor:
-    return SingleThreadedExecutor() if threads == 1 else MultiThreadedExecutor(num_threads=threads)
