@@ -150,7 +150,7 @@ _PLANNED: list[FloatArray] = []
 def true_deviations(robot: Robot, q: FloatArray, seed: int) -> dict[str, float]:
     """Drawn errors; none where the data cannot tell, so that truth and estimate mean the same."""
     found = analyse(robot.jacobian(q).reshape(-1, len(robot.parameter_names)), robot.parameter_names)
-    kept = {robot.parameter_names[i] for i in found.kept}
+    kept = {robot.parameter_names[i] for i in found.free}
     drawn = random_deviations(robot, seed)
     return {n: v for n, v in drawn.items() if n in kept and not is_nuisance(n)}
 

@@ -30,9 +30,9 @@ from calib_planner.arrays import FloatArray
 from calib_planner.identification import start_robot
 from calib_planner.io import read_measurements
 from calib_planner.planning import Candidates, PlanProblem, plan
-from calib_planner.planning.bound import relax_pool
+from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.criteria import Determinant
-from calib_planner.planning.search.exchange import PoolProblem, choose
+from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.robot import analyse
 
 COUNTS = (10, 20, 30)
@@ -55,7 +55,7 @@ def base_rows(robot: Robot, q: FloatArray) -> FloatArray:
     """
     jacobian = np.ascontiguousarray(robot.jacobian(q))
     found = analyse(jacobian.reshape(-1, jacobian.shape[2]), robot.parameter_names)
-    rows = np.ascontiguousarray(jacobian[:, :, sorted(found.kept)])
+    rows = np.ascontiguousarray(jacobian[:, :, sorted(found.free)])
     flat = rows.reshape(-1, rows.shape[2])
     triangle = np.linalg.qr(flat / np.sqrt(len(q)), mode="r")
     return np.ascontiguousarray(np.linalg.solve(triangle.T, flat.T).T).reshape(rows.shape)
@@ -64,10 +64,10 @@ def base_rows(robot: Robot, q: FloatArray) -> FloatArray:
 def ours(rows: FloatArray, count: int) -> tuple[list[int], float]:
     """Chosen rows and the D-efficiency, from the rows to the answer."""
     nothing = np.zeros((rows.shape[2], rows.shape[2]))
-    relaxed = relax_pool(rows, Determinant(), nothing, count, count)
-    problem = PoolProblem(rows, Determinant(), nothing, count, weights=relaxed.weights)
+    relaxed = candidate_design(rows, Determinant(), nothing, count, count)
+    problem = ChoiceProblem(rows, Determinant(), nothing, count, weights=relaxed.weights)
     found = choose(problem, np.random.default_rng(0))
-    return found.rows.tolist(), float(np.exp(found.log_worth)) / relaxed.bound
+    return found.rows.tolist(), float(np.exp(found.log_value)) / relaxed.bound
 
 
 def log_det(rows: FloatArray, chosen: list[int]) -> float:

@@ -6,10 +6,10 @@ real, calibrated robot has it at T_cal(q). ``compensate`` finds angles q′ near
     T_cal(q′) = T_nom(q),
 
 so that a controller told q′ has the real tool where the plan, made with the nominal model, says. If the joints
-turn by φ(q) beyond what they read, the angles found are those they must be at, and q′ is what they must read.
+turn by φ(q) beyond what they read, the computed angles are those they must be at, and q′ is what they must read.
 Both poses are in the robot's own base frame: where the base stands before the tracker plays no part. The pose is
 that of the tip's frame; ``position_only`` asks for one point only (a target: where it is on the nominal robot,
-and where it was found to be on the calibrated one). That is the right question if the orientation does not
+and where it is on the calibrated one). That is the right question if the orientation does not
 matter, if the robot has fewer than six joints, or if the orientation of the calibrated tip is not known: a single
 reflector says where a point of the tool is, never how the tool is turned about it.
 """
@@ -191,9 +191,9 @@ def _status(
     low, high = robot.joint_limits.T
     outside = limits & (np.isfinite(bounds[0]) & ((q < low) | (q > high))).any(axis=1)
     reached = _reached(*errors)
-    stopped = ((corrected <= bounds[0]) | (corrected >= bounds[1])).any(axis=1)
+    at_bound = ((corrected <= bounds[0]) | (corrected >= bounds[1])).any(axis=1)
     far = np.abs(corrected - q).max(axis=1) > FAR
-    cases = [outside, reached & far, reached, stopped]
+    cases = [outside, reached & far, reached, at_bound]
     return tuple(np.select(cases, ["outside_limits", "far", "reached", "at_limit"], "closest").tolist())
 
 

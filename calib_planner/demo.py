@@ -8,7 +8,7 @@ noise, fresh draws.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,7 +21,7 @@ from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.io import make_folder, write_estimate, write_measurements, write_plan, write_text
-from calib_planner.planning import InformationModel, Plan, PlanProblem, Progress, Search, error_variance, plan
+from calib_planner.planning import Callback, InformationModel, Plan, PlanProblem, Search, error_variance, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, independent_seeds, random_deviations
@@ -123,7 +123,7 @@ class DemoResult:
 def run_demo(
     settings: DemoSettings,
     folder: str | Path,
-    callback: Callable[[Progress], bool | None] | None = None,
+    callback: Callback | None = None,
 ) -> DemoResult:
     """Run the demonstration and leave its files in ``folder``, which is made if need be.
 

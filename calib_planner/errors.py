@@ -73,7 +73,7 @@ class InfeasibleError(CalibPlannerError):
 
 
 class NotEnoughDataError(CalibPlannerError):
-    """The data cannot determine what is asked, whatever their values.
+    """The data cannot determine the wanted parameters, whatever their values.
 
     Attributes:
         have: Number of scalar equations at hand.

@@ -291,7 +291,7 @@ OLD_NAMES = {
 OLD_TEXT = {
     r"worth": "value",
     r"slopes?": "gradient",
-    r"relax(?:ed|ation)?": "approximate design",
+    r"relaxed|relaxation": "approximate design",  # limits may be relaxed, designs are approximate
     r"pools?": "candidates",
     r"asked": "problem, request, wanted",
     r"(?<!not )found": "identified, estimated, computed …",
@@ -308,9 +308,7 @@ ALLOWED_TEXT = re.compile(r"ThreadPool|ProcessPool|threadpool|held.out|hand on t
 EXEMPT = ("identification",)
 """Its inside is rewritten next; its names come then."""
 LEFT_NAMES = {
-    "robot": 11,
     "acquisition": 22,
-    "planning": 160,
     "campaign": 40,
     "simulation": 3,
     "io": 21,
@@ -319,11 +317,7 @@ LEFT_NAMES = {
 }
 LEFT_TEXT = {
     "errors": 1,
-    "robot": 3,
-    "tracker": 3,
     "acquisition": 3,
-    "planning": 116,
-    "compensation": 2,
     "campaign": 19,
     "simulation": 5,
     "io": 10,

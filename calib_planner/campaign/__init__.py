@@ -1,18 +1,20 @@
 """Measuring as long as it takes: plan, measure, identify, plan the rest from what was measured, validate."""
 
 from calib_planner.campaign.decide import decide
+from calib_planner.campaign.finish import RULES
 from calib_planner.campaign.problem import OUTCOMES, CampaignProblem, CampaignResult, Exclusion, Round
 from calib_planner.campaign.run import Instrument, Unreachable, run_campaign
 from calib_planner.campaign.state import (
     FIT,
     VALIDATION,
     CampaignState,
-    Decision,
     Finished,
     Measure,
+    Measurement,
+    NextStep,
     Paused,
+    PlannedConfiguration,
     Replan,
-    Row,
     Validate,
     begin,
     from_measurements,

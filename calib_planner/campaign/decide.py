@@ -8,16 +8,16 @@ For the fit, in this order:
 2. More than ``most_failures`` configurations had to be given up: **unreachable**.
 3. No measurement is left but those of the validation: **budget_spent**.
 4. What repetitions prove to be the robot's own, not noise, is more than required at a test pose even if nothing
-   else were uncertain: **limited**. More measurements would be an afternoon burnt. Errors of the joints can be
-   learnt, though, so where that is allowed this waits for ``LEARNABLE`` configurations.
-5. If it is open whether it is noise, measured configurations are measured again: that is what tells.
+   else were uncertain: **limited**. More measurements cannot help. Errors of the joints can be learnt, though, so
+   where that is allowed this waits for ``LEARNABLE`` configurations.
+5. If it is open whether the scatter is noise, measured configurations are measured again: repetitions decide it.
 6. Else the next batch is planned on the robot as identified so far, with the noise as estimated and all that was
-   measured; for a robot with a discrepancy as ``design.discrepancy`` says, from random candidates.
+   measured; for a robot with a discrepancy (see ``planning.ModelDiscrepancy``) from random candidates.
 
-Then the validation. Good plans measure at few places, where a wrong model fits well enough: what contradicts it
-best are configurations chosen for nothing but being elsewhere. If they do (χ², see ``requirement``), where the
-accuracy seemed to be reached, and the budget allows, they join the fit, which goes on, and others are held out in
-the end. What is reported is always of configurations that took no part.
+Then the validation. Good plans measure at few places, where a wrong model fits well enough; configurations that
+were chosen to lie elsewhere contradict it best. If they do (χ², see ``finish``) although the accuracy seemed to
+be reached, and if the budget allows, they join the fit, which goes on, and others are held out in the end. The
+validation that is reported is always of configurations that took no part in the fit.
 
 The uncertain part ρ of the predicted error falls with 1/√N, its floor φ stays, so that what is required, ρ̄, takes
 
@@ -33,31 +33,39 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc
 
-from calib_planner.arrays import FloatArray
-from calib_planner.campaign.batch import next_batch, plan_problem, toured, validation_poses
-from calib_planner.campaign.findings import Finding, forecast, found_in, outcome_of, round_of
-from calib_planner.campaign.problem import OUTCOMES, CampaignResult
-from calib_planner.campaign.state import FINISHED, FIT, VALIDATION, CampaignState, Decision, Stop
-from calib_planner.errors import CalibPlannerError, InfeasibleError, NotEnoughDataError
-from calib_planner.identification import (
-    DOUBT,
-    LEVELS,
-    SAME_JOINT,
-    Estimate,
-    Reason,
-    Verdict,
-    normalised,
-    validate,
+from calib_planner.campaign.assess import (
+    OPEN,
+    Assessment,
+    assess,
+    different,
+    forecast,
+    outcome_of,
+    ready,
+    round_of,
 )
-from calib_planner.measurements import Measurements
-from calib_planner.planning import Feasibility
-from calib_planner.tracker import Noise
-from calib_planner.units import counted, length
+from calib_planner.campaign.finish import ended, toured, validation
+from calib_planner.campaign.state import FIT, VALIDATION, CampaignState, NextStep, PlannedConfiguration
+from calib_planner.errors import CalibPlannerError, InfeasibleError, NotEnoughDataError
+from calib_planner.identification import FEWEST_SPARE
+from calib_planner.planning import (
+    Candidates,
+    Feasibility,
+    PlanPrior,
+    PlanProblem,
+    Search,
+    plan,
+    plan_space,
+    smallest_size,
+)
+
+REPEATED = 4
+"""Configurations of the first batch measured twice: 12 degrees of freedom for the noise of one target."""
+CANDIDATES = 500
+"""Candidates for a plan with discrepancy."""
 
 
-def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) -> Decision:
+def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) -> NextStep:
     """What follows from what was measured.
 
     Args:
@@ -70,174 +78,117 @@ def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) ->
     if state.phase == VALIDATION:
         return validation(state)
     try:
-        found = found_in(state)
+        known = assess(state)
     except NotEnoughDataError:
-        found = None
+        known = None
     except CalibPlannerError as error:
         return ended(state, None, "failed", str(error))
-    outcome, message = outcome_of(state, found)
+    outcome, message = outcome_of(state, known)
     if outcome:
-        return ended(state, found, outcome, message)
+        return ended(state, known, outcome, message)
     try:
-        return next_batch(state, found, stopped)
+        return next_batch(state, known, stopped)
     except InfeasibleError as error:
-        if not state.rounds and not state.rows:
+        if not state.rounds and not state.measurements:
             raise
-        return ended(state, found, "unreachable", str(error))
+        return ended(state, known, "unreachable", str(error))
 
 
-# ── The end of a campaign: held-out configurations, what they say, the result; see ``decision`` ─────────────
+# ── The next batch ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def ended(state: CampaignState, found: Finding | None, outcome: str, message: str) -> Decision:
-    """The fit has ended: on to the validation, or to the result."""
-    text = f"{outcome}: {message}"
-    made = None if found is None and not state.rows else round_of(state, found, 0, text)
-    left = 0.0 if outcome == "reached" or found is None else forecast(found, state.problem.required_accuracy)
-    after = replace(state, outcome=outcome, message=message, left=left)
-    if made is not None:
-        after = replace(after, rounds=(*state.rounds, made))
-    return replace(validation(after, found), outcome=outcome, round=made, left=left)
-
-
-def validation(state: CampaignState, found: Finding | None = None) -> Decision:
-    """More validation configurations if some are wanting, else the result."""
+def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable[[], bool]) -> NextStep:
     problem = state.problem
-    if found is None:
-        try:
-            found = found_in(state)
-        except CalibPlannerError:
-            found = None
-    if found is None:
-        return Decision(FINISHED, state.message, result=_result(state, None))
-    wanting = min(problem.validation - len(state.of_role(VALIDATION)), problem.budget - state.spent())
-    if wanting > 0 and state.given_up <= problem.most_failures + problem.validation:
-        q = _held_out(state, found, wanting)
-        if len(q):
-            first = len(state.stops)
-            queue = toured(state, q, tuple(range(first, first + len(q))))
-            stops = tuple(Stop(row, VALIDATION) for row in q)
-            return Decision(VALIDATION, state.message, stops, (), queue, left=state.left)
-    held_out = state.data(VALIDATION)
-    if held_out is not None and contradicted(found.estimate, found.noise, held_out):
-        if state.outcome == "reached" and problem.budget - state.spent() > problem.validation:
-            text = "the validation contradicts what was predicted: its measurements join the fit, which goes on"
-            return Decision(FIT, text, joins=True)
-        state = replace(state, message=f"{state.message}; the validation contradicts what was predicted")
-    return Decision(FINISHED, state.message, left=state.left, result=_result(state, found))
+    allowed = problem.fit_budget - state.spent(FIT)
+    if known is not None and known.scatter == OPEN and (again := _to_repeat(state, min(problem.batch, allowed))):
+        text = "more scatter than the instrument's: measuring again tells whether it is noise or the robot"
+        queue = toured(state, np.array([state.configurations[i].q for i in again]), again)
+        times = tuple((i, 1) for i in again)
+        return NextStep(FIT, text, again=times, queue=queue, round=round_of(state, known, len(again), text),
+                        left=_left(state, known))  # fmt: skip
+    request = plan_problem(state, known)
+    size, repeated = _size(state, known, request, allowed)
+    made = plan(_sized(request, size, state, known), lambda progress: stopped())
+    q = made.configurations
+    first = len(state.configurations)
+    queue = toured(state, q, tuple(range(first, first + len(q))))
+    twice = _spread(queue, min(repeated, allowed - len(q)))
+    stops = tuple(PlannedConfiguration(row, FIT, 1 + (first + k in twice)) for k, row in enumerate(q))
+    left = _left(state, known)
+    if known is None and np.isfinite(made.quality.predicted_accuracy):
+        share = max(made.quality.predicted_accuracy / problem.required_accuracy, 0.0) ** 2
+        left = max(float(np.ceil(len(q) * share)), float(len(q) + len(twice)))
+    total = len(queue) + len(twice)
+    text = f"{total} measurements planned"
+    made_round = round_of(state, known, total, text)
+    return NextStep(FIT, text, stops, (), (*queue, *reversed(twice)), round=made_round, left=left)
 
 
-def _held_out(state: CampaignState, found: Finding, count: int) -> FloatArray:
-    request = plan_problem(state, found)
-    rng = np.random.default_rng([state.problem.seed, len(state.stops), 4])
-    taken = np.vstack([state.measured_q, *(s.q for s in state.stops)])
-    try:
-        allowed = Feasibility(state.problem.robot, request.constraints)
-        return validation_poses(allowed, state.problem.test_pose_array, taken, state.scale, count, rng)
-    except InfeasibleError:
-        return taken[:0]
-
-
-def _result(state: CampaignState, found: Finding | None) -> CampaignResult:
-    held_out = state.data(VALIDATION)
-    estimate = None if found is None else found.estimate
-    if found is not None and estimate is not None and held_out is not None:
-        estimate = validate(found.asked, estimate, [held_out])
-    message = state.message or OUTCOMES[state.outcome]
-    if estimate is None:
-        verdict = without_estimate(state.outcome, message)
-    else:
-        verdict = campaign_verdict(estimate, state.problem.required_accuracy, _at_test_poses(state))
-    return CampaignResult(
-        outcome=state.outcome,
-        message=message,
-        required_accuracy=state.problem.required_accuracy,
-        rounds=state.rounds,
-        estimate=estimate,
-        verdict=verdict,
-        fit=state.data(FIT),
-        validation=held_out,
-        exclusions=state.exclusions,
-        spent=state.spent(),
-        budget=state.problem.budget,
+def plan_problem(state: CampaignState, known: Assessment | None) -> PlanProblem:
+    """The plan problem of the next batch, but for the number of configurations."""
+    problem = state.problem
+    prior = problem.identification.get("prior")
+    std = {} if prior is None else dict(zip(prior.names, np.sqrt(np.diag(prior.covariance)), strict=True))
+    poses = problem.test_pose_array
+    return PlanProblem(
+        problem.robot if known is None else known.estimate.calibrated,
+        poses,
+        1,
+        noise=problem.instrument if known is None else known.noise,
+        criterion="test_pose" if len(poses) == 1 else "worst_pose",
+        constraints=state.constraints,
+        prior=PlanPrior(std=std, measured=None if known is None else known.used),
+        search=Search(
+            starts=problem.starts, seed=problem.seed + len(state.rounds), time_limit=problem.time_limit
+        ),
     )
 
 
-def _at_test_poses(state: CampaignState) -> Measurements | None:
-    """The validation measurements of the test poses themselves."""
-    poses, rows = state.problem.test_pose_array, state.of_role(VALIDATION)
-    q = [state.stops[r.index].q for r in rows]
-    at = [k for k, one in enumerate(q) if (np.abs(poses - one).max(axis=1) < SAME_JOINT).any()]
-    data = state.data(VALIDATION)
-    return data.select(at) if data is not None and at else None
+def _size(state: CampaignState, known: Assessment | None, request: PlanProblem, allowed: int) -> tuple[int, int]:
+    """Configurations to plan, and how many of them to measure twice.
 
-
-# ── The verdict on a campaign: that on the estimate, and whether it is what was asked for ───────────────────
-# The requirement is about the test poses. The validation configurations elsewhere are judged by what was
-# predicted
-# *there*; only those at a test pose are held against the requirement itself. What the tracker adds to such a
-# point is not the robot's error: three coordinates of variance σ² each, and two standard deviations more than
-# that, are taken off,
-#
-#     e² = mean ‖r‖² − 3σ² (1 + 2 √(2/(3n))).
-#
-# A validation *contradicts* the estimate if Σ rᵀ(J C Jᵀ + D + R)⁻¹r over its points is improbable as χ².
-
-
-def campaign_verdict(estimate: Estimate, required: float, at_test_poses: Measurements | None) -> Verdict:
-    """PASS, WARN or FAIL with reasons.
-
-    Args:
-        estimate: With its validation, without a requirement of its own.
-        required: Largest root mean square error at a test pose that will do [m].
-        at_test_poses: Held-out measurements of test poses themselves, or ``None``.
+    Raises:
+        InfeasibleError: The budget does not allow what identification needs.
     """
-    reasons = [_predicted(estimate, required)]
-    if at_test_poses is not None:
-        reasons.append(_achieved(estimate, required, at_test_poses))
-    reasons += estimate.verdict.reasons
-    reasons.sort(key=lambda r: -LEVELS.index(r.level))
-    return Verdict(reasons[0].level, tuple(reasons))
+    problem = state.problem
+    if known is not None and ready(state, known):
+        return int(np.clip(forecast(known, problem.required_accuracy), 1, min(problem.batch, allowed))), 0
+    least = smallest_size(request)
+    space = plan_space(replace(request, configurations=max(least, 1)))
+    apart = None if known is None else different(known.used)
+    have, seen = (0, 0) if apart is None else (len(apart), int(apart.seen.sum()))
+    wanted = -(-(len(space.robot.parameter_names) + FEWEST_SPARE) // 3) - seen
+    size = max(least, problem.minimum - have, -(-wanted // len(problem.robot.targets)), 1)
+    if size > allowed:
+        text = f"{allowed} measurements are left for the fit, {size} at least are needed to judge it: raise it"
+        raise InfeasibleError("budget", text)
+    return size, REPEATED if known is None else 0
 
 
-def contradicted(estimate: Estimate, noise: Noise, held_out: Measurements) -> bool:
-    """Whether held-out measurements are improbably far from what was predicted, for as sure as it was."""
-    q, seen = held_out.q, held_out.seen
-    if estimate.transmission is not None:
-        covariance = estimate.transmission.error_covariance(q)
-    else:
-        robot = estimate.calibrated
-        columns = np.ascontiguousarray(robot.jacobian(q)).reshape(*held_out.p.shape, -1)
-        covariance = columns @ estimate.fit.covariance @ np.swapaxes(columns, 2, 3)
-        covariance = covariance + estimate.noise.discrepancy_covariance(robot, q)
-    predicted = estimate.positions(q)
-    distance = normalised(held_out.p - predicted, covariance + noise.covariance(predicted))[seen]
-    return float(chdtrc(3 * len(distance), np.sum(distance**2))) < DOUBT
-
-
-def without_estimate(outcome: str, message: str) -> Verdict:
-    """The verdict on a campaign that identified nothing."""
-    return Verdict("FAIL", (Reason("FAIL", outcome, message, OUTCOMES[outcome]),))
-
-
-def _predicted(estimate: Estimate, required: float) -> Reason:
-    worst = float(np.max(estimate.accuracy.predicted))
-    level = "PASS" if worst <= required else "FAIL"
-    said = length(worst) if np.isfinite(worst) else "nothing"
-    text = f"predicted at the worst test pose: {said} where {length(required)} are required"
-    return Reason(
-        level, "required_accuracy", text, "" if level == "PASS" else "the outcome says what stands in the way"
+def _sized(request: PlanProblem, size: int, state: CampaignState, known: Assessment | None) -> PlanProblem:
+    """The request for ``size`` configurations, from candidates where the robot has a discrepancy."""
+    discrepancy = None if known is None else known.discrepancy
+    if discrepancy is None:
+        return replace(request, configurations=size)
+    rng = np.random.default_rng([state.problem.seed, len(state.rounds), 3])
+    q = Feasibility(request.robot, request.constraints).sample(rng, CANDIDATES)
+    return replace(
+        request, configurations=size, criterion="test_pose", candidates=Candidates(q), discrepancy=discrepancy
     )
 
 
-def _achieved(estimate: Estimate, required: float, data: Measurements) -> Reason:
-    residuals = (data.p - estimate.positions(data.q))[data.seen]
-    square = float(np.mean(np.sum(residuals**2, axis=1)))
-    noise = 3.0 * estimate.noise.measurement**2
-    error = float(np.sqrt(max(square - noise * (1.0 + 2.0 * np.sqrt(2.0 / (3.0 * len(residuals)))), 0.0)))
-    level = "PASS" if error <= required else "FAIL"
-    points, rms, tracker = counted(len(residuals), "point"), float(np.sqrt(square)), float(np.sqrt(noise))
-    text = f"achieved at the test poses, {points}: {length(rms)} with the tracker's noise of {length(tracker)}"
-    text += f", {length(required)} required"
-    advice = "" if level == "PASS" else "something differs there: load, temperature, approach, the target's seat"
-    return Reason(level, "achieved_at_test_poses", text, advice)
+def _to_repeat(state: CampaignState, count: int) -> tuple[int, ...]:
+    """Stops to measure again: those measured fewest times, first those measured last."""
+    rows = state.measurements_of(FIT)
+    times = {i: sum(r.index == i for r in rows) for i in {r.index for r in rows} - set(state.dropped)}
+    return tuple(sorted(times, key=lambda i: (times[i], -i))[:count])
+
+
+def _spread(queue: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """``count`` of the visits, spread evenly over the tour."""
+    rows = np.unique(np.linspace(0, len(queue) - 1, max(min(count, len(queue)), 0)).round().astype(int))
+    return tuple(queue[k] for k in rows)
+
+
+def _left(state: CampaignState, known: Assessment | None) -> float:
+    return float("nan") if known is None else forecast(known, state.problem.required_accuracy)

@@ -1,4 +1,4 @@
-"""What is asked of a campaign: an accuracy at the test poses, and how much may be measured for it."""
+"""The problem and the result of a campaign: which accuracy, how much may be measured, and how it ended."""
 
 from __future__ import annotations
 
@@ -154,14 +154,14 @@ class Exclusion:
         q: (joints,) [rad | m].
         radius: r, a share of each joint's range.
         reason: Why, in words.
-        asked: Whether a person asked for it.
+        requested: Whether a person wanted it.
     """
 
     index: int
     q: FloatArray
     radius: float
     reason: str
-    asked: bool = False
+    requested: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "q", frozen(np.asarray(self.q, float)))
@@ -216,8 +216,8 @@ def radius_of(
 
 OUTCOMES = {
     "reached": "the predicted accuracy is what was required",
-    "budget_spent": "the budget was spent first: raise it, or live with the accuracy predicted",
-    "limited": "more measurements cannot do it: what no geometric model holds is more than was required; "
+    "budget_spent": "the budget was spent first: raise it, or accept the predicted accuracy",
+    "limited": "more measurements cannot help: errors that no geometric model holds are larger than required; "
     "calibrate closer to the task, or compensate locally",
     "unreachable": "too little is left that can be measured: widen limits and constraints, or move the tracker",
     "failed": "the measurements cannot be identified",
@@ -261,7 +261,7 @@ class CampaignResult:
     Attributes:
         outcome: A key of ``OUTCOMES``.
         message: What it means here.
-        required_accuracy: What was asked for [m].
+        required_accuracy: As in the problem [m].
         rounds: How it went.
         estimate: What was identified, with its validation; ``None`` if nothing could be.
         verdict: PASS, WARN or FAIL with reasons.
@@ -301,7 +301,9 @@ class CampaignResult:
             "verdict": asdict(self.verdict),
             "measurements": _rows(self.fit),
             "validation_measurements": _rows(self.validation),
-            "excluded": [{"configuration": e.q, "reason": e.reason, "asked": e.asked} for e in self.exclusions],
+            "excluded": [
+                {"configuration": e.q, "reason": e.reason, "asked": e.requested} for e in self.exclusions
+            ],
             "estimate": None if self.estimate is None else self.estimate.to_dict(),
         }
         found: dict[str, Any] = plain(result)

@@ -1,7 +1,7 @@
 """A campaign as a value: what was planned, what was measured, what failed; events in, the next action out.
 
 Nothing here computes: ``next_action`` and the events take microseconds, so that whoever moves the robot always
-knows what to do. What takes seconds is a ``Decision``, made by ``decide`` from a state anywhere (a worker thread)
+knows what to do. What takes seconds is a ``NextStep``, made by ``decide`` from a state anywhere (a worker thread)
 and taken in by ``decided`` whenever it is ready; events that came meanwhile are kept.
 
     Replan ──decide──▶ Measure … Measure ──▶ Replan ──▶ … ──▶ Validate ──▶ Measure … ──▶ Validate ──▶ Finished
@@ -19,19 +19,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, check_array, frozen
-from calib_planner.campaign.problem import CampaignProblem, Exclusion, distances, joint_scale, radius_of
+from calib_planner.campaign.problem import (
+    AwayFrom,
+    CampaignProblem,
+    CampaignResult,
+    Exclusion,
+    Round,
+    distances,
+    joint_scale,
+    radius_of,
+)
 from calib_planner.errors import InputError
 from calib_planner.identification import configuration_labels
 from calib_planner.measurements import Measurements
-
-if TYPE_CHECKING:
-    from calib_planner.campaign.problem import CampaignResult, Round
+from calib_planner.planning import Constraint
 
 FIT, VALIDATION, FINISHED = "fit", "validation", "finished"
 PHASES = (FIT, VALIDATION, FINISHED)
@@ -40,8 +46,8 @@ LARGEST = 1e5
 
 
 @dataclass(frozen=True, eq=False)
-class Stop:
-    """A configuration (joints,) [rad | m], for ``fit`` or ``validation``, to be measured ``times`` times."""
+class PlannedConfiguration:
+    """A configuration q (joints,) [rad | m], to be measured ``times`` times for ``fit`` or ``validation``."""
 
     q: FloatArray
     role: str
@@ -52,12 +58,12 @@ class Stop:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class Measurement:
     """A measurement.
 
     Attributes:
-        number: Its own, for undo.
-        index: Number of its stop.
+        number: Its own, by which it can be withdrawn.
+        index: Number of its configuration.
         q: (joints,) where the robot stood [rad | m].
         points: (targets, 3) [m]; NaN where a target was not seen.
     """
@@ -73,7 +79,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """Measure the targets at ``q`` (joints,), stop ``index``, for the ``repetition``-th time, from 0."""
+    """Visit configuration ``index``, at q (joints,) [rad | m], for the ``repetition``-th time, from 0."""
 
     index: int
     q: FloatArray
@@ -88,12 +94,12 @@ class Replan:
 
 @dataclass(frozen=True)
 class Validate:
-    """Choose what to validate with, or compare and judge: ``decide``."""
+    """Choose configurations to validate with, or compare and judge: ``decide``."""
 
 
 @dataclass(frozen=True)
 class Paused:
-    """Wait for ``resumed``."""
+    """Wait for ``resume``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,16 +117,16 @@ class CampaignState:
     """Everything about a campaign; made by ``begin`` or ``from_measurements``.
 
     Attributes:
-        problem: What is asked.
-        stops: All configurations planned so far; their place is their number.
-        queue: Numbers of the stops still to be visited, in order; a stop to be measured twice is there twice.
-        rows: The measurements, in the order of coming.
+        problem: Robot, requirement and budget.
+        configurations: All that were planned so far; their place is their number.
+        queue: Numbers of the configurations still to be visited, in order, one entry a visit.
+        measurements: In the order of coming.
         failures: ``(index, reason)`` of every attempt that gave no measurement.
-        exclusions: Stops given up, never measured.
-        dropped: Numbers of stops that were measured, and could not be again.
+        exclusions: Configurations given up that were never measured.
+        dropped: Numbers of configurations that were measured and could not be measured again.
         rounds: What was decided after each batch.
         phase: One of ``PHASES``.
-        outcome: Why no more is measured for the fit, a key of ``result.OUTCOMES``; empty before.
+        outcome: Why no more is measured for the fit, a key of ``OUTCOMES``; empty before.
         message: The outcome or what goes on, in words.
         left: Forecast of measurements still needed for the fit; infinite: it cannot be reached.
         paused: Whether nothing is to be sent to the robot.
@@ -128,9 +134,9 @@ class CampaignState:
     """
 
     problem: CampaignProblem
-    stops: tuple[Stop, ...] = ()
+    configurations: tuple[PlannedConfiguration, ...] = ()
     queue: tuple[int, ...] = ()
-    rows: tuple[Row, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
     failures: tuple[tuple[int, str], ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     dropped: tuple[int, ...] = ()
@@ -153,17 +159,17 @@ class CampaignState:
             return Paused()
         if self.queue:
             index = self.queue[0]
-            done = sum(r.index == index for r in self.rows)
-            return Measure(index, self.stops[index].q, self.stops[index].role, done)
+            done = sum(r.index == index for r in self.measurements)
+            return Measure(index, self.configurations[index].q, self.configurations[index].role, done)
         return Replan() if self.phase == FIT else Validate()
 
-    def of_role(self, role: str) -> tuple[Row, ...]:
+    def measurements_of(self, role: str) -> tuple[Measurement, ...]:
         """Measurements for the fit, or for the validation."""
-        return tuple(r for r in self.rows if self.stops[r.index].role == role)
+        return tuple(r for r in self.measurements if self.configurations[r.index].role == role)
 
     def data(self, role: str = FIT) -> Measurements | None:
         """The same as the library's value, or ``None``."""
-        rows = self.of_role(role)
+        rows = self.measurements_of(role)
         if not rows:
             return None
         q, points = np.array([r.q for r in rows]), np.array([r.points for r in rows])
@@ -171,36 +177,42 @@ class CampaignState:
 
     def spent(self, role: str | None = None) -> int:
         """Measurements made, those that failed included; skipped and unreachable configurations cost none."""
-        made = [r.index for r in self.rows] + [i for i, _ in self.failures]
-        return sum(role is None or self.stops[i].role == role for i in made)
+        made = [r.index for r in self.measurements] + [i for i, _ in self.failures]
+        return sum(role is None or self.configurations[i].role == role for i in made)
 
     @property
     def given_up(self) -> int:
         """Configurations that could not be measured, without those that a person asked to skip."""
-        return sum(not e.asked for e in self.exclusions) + len(self.dropped)
+        return sum(not e.requested for e in self.exclusions) + len(self.dropped)
 
     @property
     def measured_q(self) -> FloatArray:
         """(N, joints) where something was measured."""
-        q = [r.q for r in self.rows]
+        q = [r.q for r in self.measurements]
         return np.array(q).reshape(len(q), len(self.problem.robot.joint_names))
 
     @cached_property
     def scale(self) -> FloatArray:
-        """See ``exclusion.joint_scale``."""
+        """(joints,) see ``joint_scale`` [1/rad | 1/m]."""
         return joint_scale(self.problem.robot)
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """Conditions on the next configurations: the problem's, and to stay away from what was given up."""
+        away = (AwayFrom(self.exclusions, self.scale),) if self.exclusions else ()
+        return (*self.problem.constraints, *away)
 
     # ── events ───────────────────────────────────────────────────────────────────────────────────────
 
     def measured(self, index: int, q: ArrayLike, points: ArrayLike, number: int | None = None) -> CampaignState:
-        """A measurement of a stop; one whose ``number`` is there already replaces it.
+        """A configuration was measured; a measurement whose ``number`` is there already is replaced.
 
         Args:
             q: (joints,) where the robot stood [rad | m].
             points: (targets, 3) [m], NaN where a target was not seen; (3,) will do for one target.
 
         Raises:
-            InputError: No such stop, wrong shape, not a robot's numbers, no target seen at all.
+            InputError: No such configuration, wrong shape, not a robot's numbers, no target seen at all.
         """
         self._check_index(index)
         robot = self.problem.robot
@@ -217,38 +229,38 @@ class CampaignState:
         if np.isnan(clean).all():
             raise InputError("points", "NaN only", "at least one target that was seen", "report it as failed")
         if number is None:
-            number = max((r.number for r in self.rows), default=-1) + 1
-        row = Row(number, index, joints, clean)
-        if any(r.number == number for r in self.rows):
-            return replace(self, rows=tuple(row if r.number == number else r for r in self.rows))
-        return replace(self, rows=(*self.rows, row), queue=_without_first(self.queue, index))
+            number = max((r.number for r in self.measurements), default=-1) + 1
+        row = Measurement(number, index, joints, clean)
+        if any(r.number == number for r in self.measurements):
+            return replace(self, measurements=tuple(row if r.number == number else r for r in self.measurements))
+        return replace(self, measurements=(*self.measurements, row), queue=_without_first(self.queue, index))
 
     def withdrawn(self, number: int, reason: str) -> CampaignState:
-        """A measurement does not count any more (an outlier, undone): its stop is visited again, if it may be."""
-        gone = next((r for r in self.rows if r.number == number), None)
+        """A measurement no longer counts (an outlier, undone): it is visited again if attempts are left."""
+        gone = next((r for r in self.measurements if r.number == number), None)
         if gone is None:
             return self
-        state = replace(self, rows=tuple(r for r in self.rows if r.number != number))
-        if self.stops[gone.index].role != self.phase or gone.index in self._gone:
+        state = replace(self, measurements=tuple(r for r in self.measurements if r.number != number))
+        if self.configurations[gone.index].role != self.phase or gone.index in self._gone:
             return replace(state, failures=(*self.failures, (gone.index, reason)))
         return replace(state, queue=(*self.queue, gone.index)).failed(gone.index, reason)
 
     def failed(self, index: int, reason: str) -> CampaignState:
-        """The robot stood there and nothing usable came of it; given up when its attempts are used up."""
+        """A visit gave no measurement; after the last attempt the configuration is given up."""
         self._check_index(index)
         state = replace(self, failures=(*self.failures, (index, reason)))
         tries = sum(i == index for i, _ in state.failures)
-        return state._exclude(index, reason, asked=False) if tries >= self.problem.attempts else state
+        return state._exclude(index, reason, requested=False) if tries >= self.problem.attempts else state
 
     def unreachable(self, index: int, reason: str) -> CampaignState:
         """The robot cannot get there."""
         self._check_index(index)
-        return self._exclude(index, reason, asked=False)
+        return self._exclude(index, reason, requested=False)
 
     def skipped(self, index: int, reason: str = "skipped on request") -> CampaignState:
         """A person does not want the robot there."""
         self._check_index(index)
-        return self._exclude(index, reason, asked=True)
+        return self._exclude(index, reason, requested=True)
 
     def pause(self) -> CampaignState:
         """Send the robot nowhere from now on."""
@@ -258,55 +270,55 @@ class CampaignState:
         """Go on."""
         return replace(self, paused=False)
 
-    def decided(self, decision: Decision) -> CampaignState:
-        """Take in what ``decide`` found."""
-        stops = [replace(s, role=FIT) for s in self.stops] if decision.joins else list(self.stops)
-        for index, more in decision.again:
+    def decided(self, step: NextStep) -> CampaignState:
+        """Take in what ``decide`` returned."""
+        stops = [replace(s, role=FIT) for s in self.configurations] if step.joins else list(self.configurations)
+        for index, more in step.again:
             stops[index] = replace(stops[index], times=stops[index].times + more)
         return replace(
             self,
-            stops=(*stops, *decision.stops),
-            queue=(*self.queue, *(i for i in decision.queue if i not in self._gone)),
-            rounds=self.rounds if decision.round is None else (*self.rounds, decision.round),
-            phase=decision.phase,
-            outcome="" if decision.joins else decision.outcome or self.outcome,
-            message=decision.message,
-            left=decision.left,
-            result=decision.result,
+            configurations=(*stops, *step.configurations),
+            queue=(*self.queue, *(i for i in step.queue if i not in self._gone)),
+            rounds=self.rounds if step.round is None else (*self.rounds, step.round),
+            phase=step.phase,
+            outcome="" if step.joins else step.outcome or self.outcome,
+            message=step.message,
+            left=step.left,
+            result=step.result,
         )
 
-    def _exclude(self, index: int, reason: str, *, asked: bool) -> CampaignState:
+    def _exclude(self, index: int, reason: str, *, requested: bool) -> CampaignState:
         state = replace(self, queue=tuple(i for i in self.queue if i != index))
-        if any(r.index == index for r in self.rows):
+        if any(r.index == index for r in self.measurements):
             return replace(state, dropped=(*self.dropped, index))
-        q, scale = self.stops[index].q, self.scale
+        q, scale = self.configurations[index].q, self.scale
         radius = radius_of(q, self.exclusions, self.measured_q, scale, self.problem.exclusion)
-        state = replace(state, exclusions=(*self.exclusions, Exclusion(index, q, radius, reason, asked)))
+        state = replace(state, exclusions=(*self.exclusions, Exclusion(index, q, radius, reason, requested)))
         if state.given_up > self.problem.most_failures:
             return replace(state, queue=())
-        near = [i for i in state.queue if distances(self.stops[i].q[None], q, scale)[0] < radius]
+        near = [i for i in state.queue if distances(self.configurations[i].q[None], q, scale)[0] < radius]
         return replace(state, queue=tuple(i for i in state.queue if i not in near))
 
     @property
     def _gone(self) -> set[int]:
-        """Stops that are not visited any more."""
+        """Numbers of configurations that are not visited any more."""
         return {e.index for e in self.exclusions} | set(self.dropped)
 
     def _check_index(self, index: int) -> None:
-        if not 0 <= index < len(self.stops):
-            raise InputError("index", index, f"a stop, 0 to {len(self.stops) - 1}")
+        if not 0 <= index < len(self.configurations):
+            raise InputError("index", index, f"a configuration, 0 to {len(self.configurations) - 1}")
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class NextStep:
     """What ``CampaignState.decided`` takes in.
 
     Attributes:
         phase: Of the campaign from now on.
         message: What was decided, in words.
-        stops: New stops, numbered on from the state's.
-        again: ``(number, times)`` of stops to be measured more often.
-        queue: Visits, in order.
+        configurations: New ones, numbered on from the state's.
+        again: ``(number, times)`` of configurations to be measured more often.
+        queue: Numbers of the configurations to visit, in order.
         outcome: Why the fit ends, if it does.
         round: What is known now.
         joins: Whether the validation's measurements join the fit.
@@ -316,7 +328,7 @@ class Decision:
 
     phase: str
     message: str
-    stops: tuple[Stop, ...] = ()
+    configurations: tuple[PlannedConfiguration, ...] = ()
     again: tuple[tuple[int, int], ...] = ()
     queue: tuple[int, ...] = ()
     outcome: str = ""
@@ -339,7 +351,7 @@ def from_measurements(
 ) -> CampaignState:
     """A campaign that goes on from measurements made before, such as those that a store kept over a crash.
 
-    What was planned and not measured is planned anew. Rows of one configuration are repetitions of one stop.
+    What was planned and not measured is planned anew. Rows with equal joint values are repetitions.
 
     Raises:
         InputError: Other joints or targets than the robot's.
@@ -350,9 +362,12 @@ def from_measurements(
             continue
         ordered = data.in_order_of(problem.robot.joint_names)
         labels = configuration_labels(ordered.q)
-        first = len(state.stops)
-        stops = [Stop(ordered.q[labels == k][0], role, int((labels == k).sum())) for k in range(labels.max() + 1)]
-        state = replace(state, stops=(*state.stops, *stops))
+        first = len(state.configurations)
+        stops = [
+            PlannedConfiguration(ordered.q[labels == k][0], role, int((labels == k).sum()))
+            for k in range(labels.max() + 1)
+        ]
+        state = replace(state, configurations=(*state.configurations, *stops))
         for q, points, label in zip(ordered.q, ordered.p, labels, strict=True):
             if not np.isnan(points).all():
                 state = state.measured(first + int(label), q, points)

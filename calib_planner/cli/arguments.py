@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,17 @@ from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
+Group = argparse._ActionsContainer
+TYPICAL = "typical"
+"""The word after --prior for the data sheet within usual manufacturing errors."""
+SIGMA = 3e-5
+"""Standard deviation of one coordinate of a laser tracker, where nothing else is said [m]."""
 
 
 def add_command(
     commands: Commands, name: str, summary: str, run: Any, example: str, description: str = ""
 ) -> argparse.ArgumentParser:
-    """A command's parser with what every command has: --json, --seed, an example in --help."""
+    """A command's parser with what every command has: --json, and an example in --help."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
@@ -30,12 +35,38 @@ def add_command(
         allow_abbrev=False,
     )
     parser.set_defaults(run=run)
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout, SI units and radians")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, in SI units and radians")
     return parser
 
 
-def add_seed(parser: argparse._ActionsContainer) -> None:
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="same seed, same result (0)")
+def option(
+    group: Group,
+    flag: str,
+    metavar: str | None,
+    text: str,
+    default: Any = None,
+    kind: Callable[[str], Any] | None = None,
+    **more: Any,
+) -> None:
+    """Add an option with a value; its help ends with the default value, if it has one.
+
+    Args:
+        kind: What makes the value out of the text: by default the type of ``default``, or text.
+        more: Further arguments of ``add_argument``.
+    """
+    if default is not None:
+        kind = kind or type(default)
+        text = f"{text} ({default:g})" if isinstance(default, (int, float)) else f"{text} ({default})"
+    group.add_argument(flag, type=kind or str, default=default, metavar=metavar, help=text, **more)
+
+
+def switch(group: Group, flag: str, text: str) -> None:
+    """Add an option without a value."""
+    group.add_argument(flag, action="store_true", help=text)
+
+
+def add_seed(parser: Group) -> None:
+    option(parser, "--seed", "N", "seed of all random numbers; the same seed gives the same result", 0)
 
 
 def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: bool = True) -> None:
@@ -44,49 +75,42 @@ def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: 
     Without ``targets`` there is no option for the reflectors: they are as the robot says.
     """
     group = parser.add_argument_group("robot")
-    text = "shipped name, robot YAML or URDF" + (f" ({otherwise})" if otherwise else "")
-    group.add_argument("--robot", required=not otherwise, metavar="R", help=text)
-    group.add_argument("--base-link", metavar="LINK", help="first link of the chain in a URDF (its root)")
-    group.add_argument("--tip-link", metavar="LINK", help="last link of the chain in a URDF (its only leaf)")
+    text = "name of a shipped robot, robot YAML or URDF" + (f" ({otherwise})" if otherwise else "")
+    option(group, "--robot", "R", text, required=not otherwise)
+    add_links(group)
     parser.set_defaults(targets=None)
     if targets:
-        group.add_argument(
-            "--targets",
-            action="append",
-            type=numbers,
-            metavar='"x y z"',
-            help="a reflector in the frame of the last link [m]; repeat for several",
-        )
-    group.add_argument(
-        "--degrees",
-        action="store_true",
-        help="angles in arguments and input CSV files are degrees; what is written is always radians",
-    )
+        text = "a reflector in the frame of the last link [m]; repeat for several"
+        option(group, "--targets", '"x y z"', text, kind=numbers, action="append")
+    switch(group, "--degrees", "angles in arguments and input CSV files are degrees; output is always in radians")
+
+
+def add_links(group: Group) -> None:
+    """The two ends of the chain in a URDF."""
+    option(group, "--base-link", "LINK", "first link of the chain in a URDF (its root)")
+    option(group, "--tip-link", "LINK", "last link of the chain in a URDF (its only leaf)")
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("what is unknown")
-    group.add_argument(
-        "--parameters",
-        metavar="P",
-        help="lengths+offsets, lengths, offsets, full, or NAME,NAME,… (the robot's own; see robots show)",
-    )
-    group.add_argument(
-        "--unknown",
-        default="",
-        metavar="U",
-        help="base (pose of the robot in the tracker's frame), tool (the reflectors' offsets) or base,tool",
-    )
+    text = "lengths+offsets, lengths, offsets, full, or NAME,NAME,… (the robot's own; see robots show)"
+    option(group, "--parameters", "P", text)
+    text = "base (pose of the robot in the tracker's frame), tool (offsets of the reflectors) or base,tool (none)"
+    group.add_argument("--unknown", default="", metavar="U", help=text)
 
 
-def add_test_poses(parser: argparse._ActionsContainer, purpose: str) -> None:
-    parser.add_argument(
-        "--test-pose",
-        action="append",
-        type=numbers,
-        metavar='"q1 … qn"',
-        help=f"joint coordinates [rad | m] {purpose}; repeat for several",
-    )
+def add_test_poses(parser: Group, purpose: str) -> None:
+    text = f"joint coordinates [rad | m] {purpose}; repeat for several"
+    option(parser, "--test-pose", '"q1 … qn"', text, kind=numbers, action="append")
+
+
+def add_test_path(parser: Group) -> None:
+    option(parser, "--test-path", "FILE", "CSV with a column per joint; every row is a test pose")
+
+
+def add_joint_corrections(group: Group, choices: Sequence[str]) -> None:
+    text = "auto: errors of the joints' transmissions are learnt where the data show them; off: never"
+    option(group, "--joint-corrections", None, text, "auto", choices=choices)
 
 
 def numbers(text: str) -> list[float]:
@@ -100,7 +124,7 @@ def numbers(text: str) -> list[float]:
 def load_robot(args: argparse.Namespace) -> Robot:
     """The robot of ``add_robot``, with its targets, its parameters as the file says."""
     robot = Robot.load(args.robot, base_link=args.base_link, tip_link=args.tip_link)
-    return robot if args.targets is None else robot.with_targets(_rows("--targets", args.targets, 3))
+    return robot if args.targets is None else robot.with_targets(rows("--targets", args.targets, "xyz"))
 
 
 def choose_parameters(robot: Robot, args: argparse.Namespace) -> Robot:
@@ -111,40 +135,50 @@ def choose_parameters(robot: Robot, args: argparse.Namespace) -> Robot:
 
 def test_poses(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
     """(K, joints) of --test-pose and --test-path [rad | m], or ``None`` without either."""
-    found = []
+    poses = []
     if args.test_pose is not None:
-        rows = _rows("--test-pose", args.test_pose, len(robot.joint_names), robot.joint_names)
-        found.append(rows * angle_factors(robot, degrees=args.degrees))
+        poses.append(joint_rows("--test-pose", args.test_pose, robot, args))
     if getattr(args, "test_path", None) is not None:
-        found.append(read_configurations(args.test_path, robot, degrees=args.degrees))
-    return np.vstack(found) if found else None
+        poses.append(read_configurations(args.test_path, robot, degrees=args.degrees))
+    return np.vstack(poses) if poses else None
 
 
-def _rows(option: str, rows: Sequence[Sequence[float]], length: int, names: Sequence[str] = "xyz") -> FloatArray:
-    for row in rows:
-        if len(row) != length:
-            raise InputError(option, f"{len(row)} numbers", f"{length} numbers: {', '.join(names)}")
-    array = np.array(rows, float)
+def require_test_poses(robot: Robot, poses: FloatArray | None) -> FloatArray:
+    """``poses``, unless there are none."""
+    if poses is None:
+        expected = f"{len(robot.joint_names)} numbers: {', '.join(robot.joint_names)}"
+        raise InputError("--test-pose", "none", expected, "give --test-pose or --test-path")
+    return poses
+
+
+def joint_rows(
+    option: str, given: Sequence[Sequence[float]], robot: Robot, args: argparse.Namespace
+) -> FloatArray:
+    """(N, joints) configurations of an option [rad | m]."""
+    return rows(option, given, robot.joint_names) * angle_factors(robot, degrees=args.degrees)
+
+
+def rows(option: str, given: Sequence[Sequence[float]], names: Sequence[str]) -> FloatArray:
+    """(N, names) the numbers of an option, checked."""
+    for row in given:
+        if len(row) != len(names):
+            raise InputError(option, f"{len(row)} numbers", f"{len(names)} numbers: {', '.join(names)}")
+    array = np.array(given, float)
     if not np.isfinite(array).all():
         raise InputError(option, "a number that is not finite", "finite numbers", "correct that number")
     return array
 
 
-# ── Options that say what the instrument is and what may be measured at all ─────────────────────────────────
+# ── what the instrument is and what may be measured at all ───────────────────────────────────────────
 
 
-def add_conditions(parser: argparse._ActionsContainer) -> None:
+def add_conditions(parser: Group) -> None:
     """--constraints, and --sigma or --instrument."""
-    parser.add_argument(
-        "--constraints",
-        metavar="FILE",
-        help="YAML: workspace, floor, tracker's view, … (config/constraints.yaml shows all)",
-    )
+    text = "YAML: workspace, floor, tracker's view, … (config/constraints.yaml shows all)"
+    option(parser, "--constraints", "FILE", text)
     noise = parser.add_mutually_exclusive_group()
-    noise.add_argument(
-        "--sigma", type=float, default=3e-5, metavar="S", help="tracker's std of one coordinate [m] (3e-5)"
-    )
-    noise.add_argument("--instrument", metavar="FILE", help="YAML: noise by direction (config/instruments/)")
+    option(noise, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", SIGMA)
+    option(noise, "--instrument", "FILE", "YAML: noise by direction (config/instruments/)")
 
 
 def conditions(args: argparse.Namespace, robot: Robot) -> dict[str, Any]:
@@ -152,9 +186,7 @@ def conditions(args: argparse.Namespace, robot: Robot) -> dict[str, Any]:
     # Planning, 0.2 s, is imported for these files only.
     from calib_planner.io import read_constraints, read_instrument
 
-    result: dict[str, Any] = {}
-    if args.constraints is not None:
-        result["constraints"] = read_constraints(args.constraints, robot)
-    return result | {
-        "noise": Isotropic(args.sigma) if args.instrument is None else read_instrument(args.instrument)
-    }
+    noise = Isotropic(args.sigma) if args.instrument is None else read_instrument(args.instrument)
+    if args.constraints is None:
+        return {"noise": noise}
+    return {"noise": noise, "constraints": read_constraints(args.constraints, robot)}

@@ -24,36 +24,37 @@ from calib_planner.campaign import (
     Round,
     decide,
     from_measurements,
-    run_campaign,
 )
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
     add_conditions,
+    add_joint_corrections,
     add_parameters,
     add_robot,
     add_seed,
+    add_test_path,
     add_test_poses,
     choose_parameters,
     conditions,
     load_robot,
+    option,
+    require_test_poses,
     test_poses,
 )
-from calib_planner.cli.terminal import Terminal
+from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.errors import InputError
 from calib_planner.identification import AUTOMATIC
-from calib_planner.io import read_measurements, write_configurations, write_estimate, write_measurements
+from calib_planner.io import (
+    make_folder,
+    read_measurements,
+    write_configurations,
+    write_estimate,
+    write_measurements,
+)
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.simulation import (
-    Faults,
-    SimulatedCell,
-    Stand,
-    World,
-    independent_seeds,
-    random_deviations,
-    simulated,
-)
+from calib_planner.simulation import simulate_campaign
 from calib_planner.units import counted, length
 
 DESCRIPTION = """Plan a batch, measure it, identify, plan the rest from what was measured, until the accuracy is
@@ -68,10 +69,10 @@ EXAMPLE = """calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 
       --required-accuracy 15e-6 --measured points.csv --next next.csv"""
 DEFAULTS = {name: field.default for name, field in CampaignProblem.__dataclass_fields__.items()}
 NUMBERS = {
-    "budget": "measurements allowed in all",
-    "batch": "configurations planned at a time",
-    "validation": "of the budget, measurements that take no part in the fit",
-    "minimum": "fewest different configurations, however accurate they look",
+    "budget": "number of measurements allowed in all",
+    "batch": "number of configurations planned at a time",
+    "validation": "number of measurements, part of the budget, that take no part in the fit",
+    "minimum": "smallest number of different configurations, however accurate they look",
 }
 
 
@@ -82,38 +83,25 @@ def add(commands: Commands, summary: str) -> None:
     add_parameters(parser)
     wanted = parser.add_argument_group("what is wanted")
     add_test_poses(wanted, "where accuracy matters")
-    wanted.add_argument(
-        "--test-path", metavar="FILE", help="CSV with a column per joint; every row is a test pose"
-    )
-    wanted.add_argument(
-        "--required-accuracy", type=float, required=True, metavar="A", help="largest error at a test pose [m]"
-    )
+    add_test_path(wanted)
+    text = "largest error that is acceptable at a test pose [m]"
+    option(wanted, "--required-accuracy", "A", text, kind=float, required=True)
     work = parser.add_argument_group("what may be measured")
     for name, text in NUMBERS.items():
-        work.add_argument(f"--{name}", type=int, default=DEFAULTS[name], metavar="N",
-                          help=f"{text} ({DEFAULTS[name]})")  # fmt: skip
+        option(work, f"--{name}", "N", text, DEFAULTS[name])
     add_conditions(work)
-    work.add_argument(
-        "--joint-corrections",
-        choices=AUTOMATIC,
-        default="auto",
-        help="auto: errors of the joints' transmissions are learnt where the data show them; off: never (auto)",
-    )
+    add_joint_corrections(work, AUTOMATIC)
     hand = parser.add_argument_group("by hand")
-    hand.add_argument("--measured", metavar="FILE", help="CSV of what was measured for the fit so far")
-    hand.add_argument("--held-out", metavar="FILE", help="CSV of what was measured for validation")
-    hand.add_argument("--next", metavar="FILE", help="write what to measure next: .csv with repetitions")
+    option(hand, "--measured", "FILE", "CSV of what was measured for the fit so far")
+    option(hand, "--held-out", "FILE", "CSV of what was measured for validation")
+    option(hand, "--next", "FILE", "write what to measure next: .csv with repetitions")
     play = parser.add_argument_group("in simulation")
-    play.add_argument("--simulate", type=int, metavar="SEED", help="measure a simulated robot with hidden errors")
-    play.add_argument(
-        "--simulate-sigma", type=float, metavar="S", help="its tracker's true std of one coordinate [m] (--sigma)"
-    )
-    play.add_argument(
-        "--simulate-transmission", type=float, default=0.0, metavar="S", help="its joints err, rms [rad] (0)"
-    )
-    parser.add_argument("--output", metavar="DIR", help="folder for measurements, validation and estimate")
-    starts = DEFAULTS["starts"]
-    parser.add_argument("--starts", type=int, default=starts, metavar="N", help=f"random starts ({starts})")
+    option(play, "--simulate", "SEED", "measure a simulated robot with hidden errors", kind=int)
+    text = "true standard deviation of one coordinate of its tracker [m] (as --sigma or --instrument)"
+    option(play, "--simulate-sigma", "S", text, kind=float)
+    option(play, "--simulate-transmission", "S", "rms error of its joints' transmissions [rad]", 0.0)
+    option(parser, "--output", "DIR", "folder for measurements, validation and estimate")
+    option(parser, "--starts", "N", "number of random starts of each search", DEFAULTS["starts"])
     add_seed(parser)
 
 
@@ -142,10 +130,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
-    poses = test_poses(robot, args)
-    if poses is None:
-        wanted = f"{len(robot.joint_names)} numbers: {', '.join(robot.joint_names)}"
-        raise InputError("--test-pose", "none", wanted, "give --test-pose or --test-path")
+    poses = require_test_poses(robot, test_poses(robot, args))
     return CampaignProblem(
         robot,
         poses,
@@ -173,9 +158,9 @@ def _by_hand(args: argparse.Namespace, problem: CampaignProblem, terminal: Termi
         _answer(args, terminal, action.result, {})
         return
     numbers = list(dict.fromkeys(state.queue))
-    q = np.array([state.stops[i].q for i in numbers])
+    q = np.array([state.configurations[i].q for i in numbers])
     times = [state.queue.count(i) for i in numbers]
-    role = state.stops[numbers[0]].role
+    role = state.configurations[numbers[0]].role
     if args.next:
         write_configurations(args.next, problem.robot.joint_names, q, times, field="--next")
     result = {
@@ -208,33 +193,29 @@ def _read(args: argparse.Namespace, problem: CampaignProblem, option: str) -> Me
 
 def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Terminal) -> None:
     check_count("--simulate", args.simulate, low=0, high=2**63 - 1)
-    truth_seed, noise_seed = independent_seeds(args.simulate, 2)
     sigma = args.sigma if args.simulate_sigma is None else args.simulate_sigma
     check_number("--simulate-sigma", sigma, low=0, high=1, unit="m")
     check_number("--simulate-transmission", args.simulate_transmission, low=0, high=0.1, unit="rad")
-    errors = random_deviations(problem.robot, truth_seed)
     same = args.simulate_sigma is None and args.instrument is not None
-    cell = SimulatedCell(problem.robot, errors, sigma, problem.noise if same else None)
-    world = World(cell, Faults(transmission_error=args.simulate_transmission), truth_seed)
+    noise = problem.noise if same else None
     with terminal.progress("measuring") as update:
 
         def watch(state: CampaignState) -> None:
             accuracy = f", {length(state.rounds[-1].accuracy)}" if len(state.rounds) > 1 else ""
-            update(state.spent() / problem.budget, f"{len(state.of_role(FIT))} measured{accuracy}")
+            update(state.spent() / problem.budget, f"{len(state.measurements_of(FIT))} measured{accuracy}")
 
-        result = run_campaign(problem, simulated(world, noise_seed), watch)
-    poses = problem.test_pose_array
-    found: dict[str, Any] = {"seed": args.seed, "simulate": args.simulate, "true": errors}
+        result, world, errors = simulate_campaign(
+            problem, args.simulate, sigma, noise, args.simulate_transmission, watch
+        )
+    more: dict[str, Any] = {"seed": args.seed, "simulate": args.simulate, "true": errors}
     if result.estimate is not None:
-        stand = Stand(poses, np.arange(len(poses)), np.full(len(poses), np.inf))
-        off = result.estimate.positions(poses) - world.targets(stand)
-        found["achieved_per_test_pose"] = np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1))
-    _answer(args, terminal, result, found)
+        more["achieved_per_test_pose"] = world.errors(result.estimate.positions, problem.test_pose_array)
+    _answer(args, terminal, result, more)
 
 
 def _answer(args: argparse.Namespace, terminal: Terminal, result: CampaignResult, more: dict[str, Any]) -> None:
     if args.output:
-        _write(Path(args.output).expanduser(), result)
+        _write(make_folder(args.output, "--output"), result)
     achieved = more.get("achieved_per_test_pose")
     answer = result.to_dict() | plain(more) | {"output": args.output}
     terminal.answer(answer, partial(show_result, result, achieved))
@@ -243,10 +224,6 @@ def _answer(args: argparse.Namespace, terminal: Terminal, result: CampaignResult
 
 
 def _write(folder: Path, result: CampaignResult) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("--output", f"{folder} ({error.strerror})", "a folder that can be made") from None
     if result.fit is not None:
         write_measurements(folder / "measurements.csv", result.fit, "--output")
     if result.validation is not None:
@@ -255,7 +232,7 @@ def _write(folder: Path, result: CampaignResult) -> None:
         write_estimate(folder / "estimate.yaml", result.estimate, "--output")
 
 
-# ── A campaign for people: its verdict and outcome first, then how it went ──────────────────────────────────
+# ── a campaign for people: its verdict and outcome first, then how it went ─────────────────────────────────
 
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
 SCATTER = {
@@ -311,16 +288,9 @@ def show_next(state: CampaignState, q: FloatArray, times: Sequence[int], console
     console.print(f"{state.outcome + ': ' if state.outcome else ''}{state.message}")
     if state.rounds:
         console.print(rounds_table(state.rounds))
-    held_out = state.stops[state.queue[0]].role == VALIDATION
-    table = Table(title="measure next, for validation" if held_out else "measure next, in this order")
-    table.add_column("#", justify="right")
-    for name, turns in zip(robot.joint_names, robot.joint_is_revolute, strict=True):
-        table.add_column(f"{name}\n[{'°' if turns else 'mm'}]", justify="right")
-    table.add_column("measure", justify="right")
-    factors = np.where(robot.joint_is_revolute, 180.0 / np.pi, 1e3)
-    for i, (row, count) in enumerate(zip(q * factors, times, strict=True), 1):
-        table.add_row(str(i), *(f"{v:.2f}" for v in row), f"{count}×")
-    console.print(table)
+    held_out = state.configurations[state.queue[0]].role == VALIDATION
+    title = "measure next, for validation" if held_out else "measure next, in this order"
+    console.print(configurations_table(title, robot, q, times))
 
 
 def _left(number: float) -> str:

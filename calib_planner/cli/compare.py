@@ -9,7 +9,7 @@ from functools import partial
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.cli.arguments import Commands, add_command
+from calib_planner.cli.arguments import Commands, add_command, option
 from calib_planner.cli.plan import add_problem, make_problem
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
@@ -23,18 +23,14 @@ def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "compare", summary, run, EXAMPLE)
     work = add_problem(parser, any_criterion=False)
-    work.add_argument(
-        "--configurations", type=int, nargs="+", default=[], metavar="M", help="numbers of configurations"
-    )
-    work.add_argument(
-        "--replicate", nargs="+", default=[], metavar="KxR", help="K configurations measured R times each"
-    )
-    parser.add_argument("--random", type=int, default=20_000, metavar="N", help="random plans (20000)")
+    option(work, "--configurations", "M", "numbers of configurations", kind=int, nargs="+")
+    option(work, "--replicate", "KxR", "K configurations measured R times each", nargs="+")
+    option(parser, "--random", "N", "number of random plans", 20_000)
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work."""
-    sizes = [(m, 1) for m in args.configurations] + [_size(word) for word in args.replicate]
+    sizes = [(m, 1) for m in args.configurations or ()] + [_size(word) for word in args.replicate or ()]
     if not sizes:
         raise InputError("--configurations", "none", "at least one number", "or give --replicate 3x4")
     problem = make_problem(args, sizes[0][0], sizes[0][1])

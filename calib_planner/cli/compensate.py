@@ -11,7 +11,16 @@ from rich.console import Console
 from rich.table import Table
 
 from calib_planner.arrays import FloatArray
-from calib_planner.cli.arguments import Commands, add_command, add_robot, add_seed, load_robot, numbers
+from calib_planner.cli.arguments import (
+    Commands,
+    add_command,
+    add_robot,
+    add_seed,
+    load_robot,
+    numbers,
+    option,
+    switch,
+)
 from calib_planner.cli.terminal import Terminal
 from calib_planner.compensation import STATUS, Compensation, compensate
 from calib_planner.errors import InputError
@@ -36,29 +45,17 @@ def add(commands: Commands, summary: str) -> None:
     parser = add_command(commands, "compensate", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser, targets=False)
     what = parser.add_argument_group("what to correct")
-    what.add_argument("--estimate", required=True, metavar="FILE", help="what identify --output wrote")
-    what.add_argument(
-        "--targets", required=True, metavar="FILE", dest="joint_targets", help="CSV of joint targets [rad | m]"
-    )
-    what.add_argument(
-        "--position-only",
-        action="store_true",
-        help="only the position of a point counts, not how the tool is turned",
-    )
-    what.add_argument(
-        "--tool",
-        type=numbers,
-        metavar='"x y z"',
-        help="that point, in the frame of the last link [m] (the first reflector, as identified)",
-    )
-    what.add_argument(
-        "--geometry-only",
-        action="store_true",
-        help="leave out the joint corrections that the estimate may hold: what a calibrated URDF does",
-    )
-    what.add_argument("--ignore-limits", action="store_true", help="joint limits do not matter")
+    option(what, "--estimate", "FILE", "estimate, written by identify --output", required=True)
+    text = "CSV of joint targets [rad | m]"
+    option(what, "--targets", "FILE", text, required=True, dest="joint_targets")
+    switch(what, "--position-only", "only the position of a point counts, not how the tool is turned")
+    text = "that point, in the frame of the last link [m] (the first reflector, as identified)"
+    option(what, "--tool", '"x y z"', text, kind=numbers)
+    text = "leave out the joint corrections that the estimate may hold: what a calibrated URDF does"
+    switch(what, "--geometry-only", text)
+    switch(what, "--ignore-limits", "joint limits do not matter")
     add_seed(parser)
-    parser.add_argument("--output", metavar="FILE", help="CSV of corrected targets (stdout without --json)")
+    option(parser, "--output", "FILE", "CSV of corrected targets (stdout without --json)")
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
@@ -74,7 +71,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
     q = read_configurations(args.joint_targets, nominal, degrees=args.degrees)
     with terminal.working("correcting"):
-        found = compensate(
+        result = compensate(
             nominal,
             calibrated,
             q,
@@ -83,12 +80,12 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             corrections=None if learnt is None else learnt.corrections,
         )
     if args.output:
-        write_text(args.output, _csv(found), "--output")
+        write_text(args.output, _csv(result), "--output")
     elif not args.json:
-        print(_csv(found), end="")
+        print(_csv(result), end="")
     answer = {
         "robot": nominal.name,
-        **found.to_dict(),
+        **result.to_dict(),
         "position_only": args.position_only,
         "joint_corrections": learnt is not None,
         "output": args.output,
@@ -96,10 +93,10 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     if args.json:
         terminal.answer(answer, lambda console: None)
     else:
-        show_compensation(found, terminal.out if args.output else terminal.err)
-    for status, count in Counter(found.status).items():
+        show_compensation(result, terminal.out if args.output else terminal.err)
+    for status, count in Counter(result.status).items():
         if status != "reached":
-            terminal.note(f"{count} of {len(found.status)} targets {status}: {STATUS[status]}")
+            terminal.note(f"{count} of {len(result.status)} targets {status}: {STATUS[status]}")
 
 
 def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:
@@ -110,25 +107,25 @@ def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:
     return robot.with_targets([args.tool])
 
 
-def _csv(found: Compensation) -> str:
-    errors = [found.position_error, found.rotation_error]
-    rows: list[list[Any]] = np.column_stack([found.corrected, *errors]).tolist()
-    for row, reached in zip(rows, found.reached.tolist(), strict=True):
+def _csv(result: Compensation) -> str:
+    errors = [result.position_error, result.rotation_error]
+    rows: list[list[Any]] = np.column_stack([result.corrected, *errors]).tolist()
+    for row, reached in zip(rows, result.reached.tolist(), strict=True):
         row.append(int(reached))
-    return format_table([*found.joint_names, *ERRORS], rows)
+    return format_table([*result.joint_names, *ERRORS], rows)
 
 
-def show_compensation(found: Compensation, console: Console) -> None:
+def show_compensation(result: Compensation, console: Console) -> None:
     """Print what the correction does, in mm and mrad."""
-    table = Table("tool against nominal", title=f"{len(found.status)} targets")
+    table = Table("tool against nominal", title=f"{len(result.status)} targets")
     for column in ("mean", "largest"):
         table.add_column(column, justify="right")
     rows = [
-        ("position uncorrected [mm]", found.position_error_before),
-        ("position corrected [mm]", found.position_error),
-        ("rotation uncorrected [mrad]", found.rotation_error_before),
-        ("rotation corrected [mrad]", found.rotation_error),
-        ("joint correction [mrad | mm]", np.abs(found.corrected - found.targets).max(axis=1)),
+        ("position uncorrected [mm]", result.position_error_before),
+        ("position corrected [mm]", result.position_error),
+        ("rotation uncorrected [mrad]", result.rotation_error_before),
+        ("rotation corrected [mrad]", result.rotation_error),
+        ("joint correction [mrad | mm]", np.abs(result.corrected - result.targets).max(axis=1)),
     ]
     for label, values in rows:
         if not np.isnan(values).any():

@@ -5,25 +5,27 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib_planner.acquisition import StandstillSettings
-from calib_planner.arrays import IntArray, plain
+from calib_planner.arrays import plain
 from calib_planner.cli.arguments import (
+    TYPICAL,
     Commands,
     add_command,
+    add_joint_corrections,
     add_parameters,
     add_robot,
     add_seed,
     add_test_poses,
     choose_parameters,
     load_robot,
+    option,
+    switch,
     test_poses,
 )
 from calib_planner.cli.estimate_table import show_estimate
@@ -35,7 +37,6 @@ from calib_planner.identification import (
     Estimate,
     IdentificationProblem,
     Prior,
-    check_units,
     cross_validate,
     identify,
     typical_prior,
@@ -43,19 +44,22 @@ from calib_planner.identification import (
 )
 from calib_planner.io import (
     BagTopics,
+    Sources,
+    SourceSettings,
     is_bag,
     placement,
-    read_bag,
     read_instrument,
-    read_measurements,
     read_prior,
+    read_source,
+    read_sources,
     require_urdf,
+    user_path,
     write_calibrated_urdf,
     write_estimate,
     write_kinematics,
 )
 from calib_planner.measurements import Measurements
-from calib_planner.report import Provenance, provenance, write_report
+from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
 
@@ -92,26 +96,30 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     check_files(args)
     robot = load_robot(args)
     check_outputs(args, robot)
-    rows = read_rows(args.data, robot, args, terminal)
-    robot = _with_targets(robot, rows, args)
-    problem = _problem(robot, rows, args, terminal)
-    held_out = [_held_out(path, robot, args, terminal) for path in args.validate or ()]
+    settings = source_settings(args, terminal)
+    noise_given = args.sigma is not None or args.instrument is not None
+    sources = read_sources(args.data, robot, settings, noise_given=noise_given)
+    robot = _with_targets(robot, sources, args)
+    problem = _problem(robot, sources, args, terminal)
+    held_out = [_held_out(path, robot, args, settings) for path in args.validate or ()]
     with terminal.working("identifying"):
         estimate = _estimate(problem, held_out, args)
     settled = estimate.fit.status != "not_converged"
     written = write_outputs(args, problem, estimate) if settled else {}
-    sources = {"data": [{"file": s.path, "rows": len(s.data)} for s in rows.sources]}
-    result = estimate.to_dict() | plain(placement(estimate)) | sources | written
-    terminal.answer(result, partial(show_estimate, estimate, where=rows.where))
+    data = {"data": [{"file": s.path, "rows": len(s.data)} for s in sources.files]}
+    result = estimate.to_dict() | plain(placement(estimate)) | data | written
+    terminal.answer(result, partial(show_estimate, estimate, where=sources.where))
     if not settled:
-        raise CalibPlannerError(estimate.fit.message + (" Nothing was written." if _asked(args) else ""))
+        raise CalibPlannerError(estimate.fit.message + (" Nothing was written." if _outputs(args) else ""))
     tell_outputs(args, written, terminal)
 
 
-def _problem(robot: Robot, rows: Rows, args: argparse.Namespace, terminal: Terminal) -> IdentificationProblem:
+def _problem(
+    robot: Robot, sources: Sources, args: argparse.Namespace, terminal: Terminal
+) -> IdentificationProblem:
     return IdentificationProblem(
         robot=robot,
-        data=rows.data,
+        data=sources.data,
         sigma=args.sigma,
         loss=args.loss,
         test_poses=test_poses(robot, args),
@@ -140,152 +148,70 @@ def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args
         raise NotEnoughDataError(error.have, error.need, text) from None
 
 
-def _held_out(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Measurements:
+def _held_out(path: str, robot: Robot, args: argparse.Namespace, settings: SourceSettings) -> Measurements:
     """A file of --validate; re-seated targets may be as many as they like."""
-    source: Source = read_source(path, robot, args, terminal)
-    count, most = source.data.p.shape[1], len(robot.targets)
+    data = read_source(path, robot, settings).data
+    count, most = data.p.shape[1], len(robot.targets)
     if count > most and not args.validate_target_from:
         advice = "other reflectors need --validate-target-from N"
-        raise FileFormatError(
-            path, "header", f"points of {count} targets", f"at most {most}, as in --data", advice
-        )
-    return source.data
+        got = f"points of {count} targets"
+        raise FileFormatError(path, "header", got, f"at most {most}, as in --data", advice)
+    return data
 
 
-def _with_targets(robot: Robot, rows: Rows, args: argparse.Namespace) -> Robot:
+def _with_targets(robot: Robot, sources: Sources, args: argparse.Namespace) -> Robot:
     """The robot with as many targets as the data have, and its active parameters."""
-    count = rows.data.p.shape[1]
+    count = sources.data.p.shape[1]
     if args.targets is None and "tool" in args.unknown.split(","):
         robot = robot.with_targets(np.zeros((count, 3)))
     robot = choose_parameters(robot, args)
     if len(robot.targets) != count:
-        raise FileFormatError(
-            rows.sources[0].path,
-            "header",
-            f"points of {count} targets",
-            f"{len(robot.targets)}, as the robot or --targets says",
-            'give --targets "x y z" once per target, or --unknown tool',
-        )
+        expected = f"{len(robot.targets)}, as the robot or --targets says"
+        advice = 'give --targets "x y z" once per target, or --unknown tool'
+        raise FileFormatError(sources.files[0].path, "header", f"points of {count} targets", expected, advice)
     return robot
 
 
-def _asked(args: argparse.Namespace) -> bool:
-    return any((args.output, args.urdf_output, args.kinematics_output))
+# ── measurements ─────────────────────────────────────────────────────────────────────────────────────
 
-
-# ── The measurements that ``identify`` reads: CSV files and bags, and where each row of them came from ──────
-
-STANDSTILL = {
-    "joint_tolerance": "largest range of a joint at rest [rad | m]",
-    "point_tolerance": "largest range of a coordinate at rest, about ten times the tracker's noise [m]",
-    "settle": "left out after the joints came to rest [s]",
-    "duration": "shortest interval averaged [s]",
-    "samples": "points of a reflector wanted per standstill",
-    "minimum_samples": "points of a reflector needed to use it at all",
-}
-"""Fields of ``StandstillSettings`` that are options, with their help."""
+STANDSTILL = ("joint_tolerance", "point_tolerance", "settle", "duration", "samples", "minimum_samples")
+"""Fields of ``StandstillSettings`` that are options."""
 BAG_ONLY = ("joint_topic", "point_topic", *STANDSTILL, "repeatability", "accept_damaged")
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A file of measurements.
-
-    Attributes:
-        path: The file.
-        data: What it holds.
-        numbers: (N,) line of each row in a CSV file; number of each standstill in a bag, from 1.
-        word: What ``numbers`` count: ``line`` or ``standstill``.
-        frame_id: Frame of a bag's points; empty if none is named.
-    """
-
-    path: str
-    data: Measurements
-    numbers: IntArray
-    word: str
-    frame_id: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """All measurements, the sources' rows one after the other."""
-
-    data: Measurements
-    sources: tuple[Source, ...]
-
-    def where(self, row: int) -> str:
-        """Where row ``row``, from 0, came from: ``line 12 of points.csv``."""
-        for source in self.sources:
-            if row < len(source.data):
-                return f"{source.word} {source.numbers[row]} of {source.path}"
-            row -= len(source.data)
-        raise IndexError(row)
 
 
 def add_data(parser: argparse.ArgumentParser) -> None:
     """--data, --millimetres and what bags need."""
     data = parser.add_argument_group("measurements")
-    data.add_argument(
-        "--data", required=True, action="append", metavar="FILE", help="CSV or bag; repeat to take them together"
-    )
-    data.add_argument("--millimetres", action="store_true", help="points and std_… of all CSV files are in mm")
+    text = "CSV or bag; repeat to take several together"
+    option(data, "--data", "FILE", text, required=True, action="append")
+    switch(data, "--millimetres", "points and std_… of all CSV files are in mm")
     bags = parser.add_argument_group("measurements from bags (docs/real-robot-data.md)")
-    bags.add_argument("--joint-topic", metavar="T", help="sensor_msgs/JointState (joint_states)")
-    bags.add_argument(
-        "--point-topic",
-        action="append",
-        metavar="T",
-        help="geometry_msgs/PointStamped (tracker/point); repeat, one per reflector",
+    option(bags, "--joint-topic", "T", "topic of sensor_msgs/JointState (joint_states)")
+    text = "topic of geometry_msgs/PointStamped; repeat, one per reflector (tracker/point)"
+    option(bags, "--point-topic", "T", text, action="append")
+    for field in (f for f in fields(StandstillSettings) if f.name in STANDSTILL):
+        unit = f" [{field.metadata['unit']}]" if field.metadata["unit"] else ""
+        text = f"{field.metadata['description']}{unit} ({field.default:g})"
+        option(bags, _flag(field.name), "V", text, kind=type(field.default))
+    text = "standard deviation of a coordinate that averaging does not reduce [m] (0)"
+    option(bags, "--repeatability", "S", text, kind=float)
+    text = "use what can be read of a damaged bag"
+    bags.add_argument("--accept-damaged", action="store_true", default=None, help=text)
+
+
+def source_settings(args: argparse.Namespace, terminal: Terminal) -> SourceSettings:
+    """How the options of ``add_data`` say that files are read."""
+    given = {name: getattr(args, name) for name in STANDSTILL if getattr(args, name) is not None}
+    return SourceSettings(
+        degrees=args.degrees,
+        millimetres=args.millimetres,
+        topics=BagTopics(args.joint_topic or "joint_states", tuple(args.point_topic or ("tracker/point",))),
+        standstill=StandstillSettings(**given),
+        repeatability=args.repeatability or 0.0,
+        accept_damaged=bool(args.accept_damaged),
+        note=terminal.note,
+        progress=terminal.progress,
     )
-    defaults = {f.name: f.default for f in fields(StandstillSettings)}
-    for name, text in STANDSTILL.items():
-        value: Any = defaults[name]
-        bags.add_argument(_flag(name), type=type(value), metavar="V", help=f"{text} ({value:g})")
-    bags.add_argument(
-        "--repeatability", type=float, metavar="S", help="std of a coordinate that averaging leaves [m] (0)"
-    )
-    bags.add_argument(
-        "--accept-damaged", action="store_true", default=None, help="use what can be read of a damaged bag"
-    )
-
-
-def read_rows(paths: Sequence[str], robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Rows:
-    """All files of --data, as many reflectors in each.
-
-    Raises:
-        FileFormatError: A file does not read, or does not fit the others.
-    """
-    sources = tuple(read_source(path, robot, args, terminal) for path in paths)
-    first = sources[0]
-    for other in sources[1:]:
-        if other.data.p.shape[1] != first.data.p.shape[1]:
-            wanted = f"{first.data.p.shape[1]}, as in {first.path}"
-            raise FileFormatError(other.path, "points", f"{other.data.p.shape[1]} targets", wanted)
-    frames = {s.frame_id: s for s in sources if s.frame_id}
-    if len(frames) > 1:
-        a, b = list(frames.values())[:2]
-        got, advice = repr(b.frame_id), "transform the points: one identification has one tracker frame"
-        raise FileFormatError(b.path, "frame_id of the points", got, f"{a.frame_id!r}, as in {a.path}", advice)
-    return Rows(_together(sources, given=args.sigma is not None or args.instrument is not None), sources)
-
-
-def read_source(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Source:
-    """A CSV file or a bag.
-
-    Raises:
-        FileFormatError: As ``read_measurements`` and ``read_bag``, or the points are in millimetres.
-    """
-    source = _bag(path, robot, args, terminal) if is_bag(path) else _csv(path, robot, args, terminal)
-    count = source.data.p.shape[1]
-    try:
-        check_units(
-            robot if len(robot.targets) == count else robot.with_targets(np.zeros((count, 3))), source.data
-        )
-    except InputError as error:
-        doubtful = args.millimetres and error.field == "robot"
-        advice = "they are metres already: leave out --millimetres" if doubtful else error.advice
-        raise FileFormatError(path, error.field, error.got, error.expected, advice) from None
-    return source
 
 
 def check_files(args: argparse.Namespace) -> None:
@@ -294,9 +220,9 @@ def check_files(args: argparse.Namespace) -> None:
     Raises:
         InputError: A file twice, an option for bags without a bag, or --millimetres with one.
     """
-    taken: set[Path] = set()
+    taken = set()
     for flag, path in [("--data", p) for p in args.data] + [("--validate", p) for p in args.validate or ()]:
-        place = Path(path).expanduser().resolve()
+        place = user_path(path).resolve()
         if place in taken:
             advice = "a copy is no measurement" if flag == "--data" else "what was fitted proves nothing"
             raise InputError(flag, f"{path} again", "each file once", advice)
@@ -310,138 +236,53 @@ def check_files(args: argparse.Namespace) -> None:
             raise InputError(_flag(name), getattr(args, name), "a bag among --data or --validate")
 
 
-# ── one file ─────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _csv(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Source:
-    file = read_measurements(path, robot, degrees=args.degrees)
-    if file.ignored:
-        terminal.note(f"{path}: columns ignored: {', '.join(file.ignored)}")
-    turning = np.abs(file.data.q[:, robot.joint_is_revolute])
-    if not args.degrees and turning.size and turning.max() > 4 * np.pi:
-        terminal.note(f"{path}: joint angles up to {turning.max():.4g} rad; are they degrees (--degrees)?")
-    return Source(path, _metres(file.data) if args.millimetres else file.data, file.lines, "line")
-
-
-def _metres(data: Measurements) -> Measurements:
-    std = None if data.std is None else np.asarray(data.std) / 1e3
-    return Measurements(data.joint_names, data.q, data.p / 1e3, std)
-
-
-def _bag(path: str, robot: Robot, args: argparse.Namespace, terminal: Terminal) -> Source:
-    given = {n: getattr(args, n) for n in STANDSTILL if getattr(args, n) is not None}
-    topics = BagTopics(args.joint_topic or "joint_states", tuple(args.point_topic or ("tracker/point",)))
-    with terminal.progress(f"reading {path}") as update:
-        bag = read_bag(
-            path,
-            robot,
-            topics,
-            StandstillSettings(**given),
-            repeatability=args.repeatability or 0.0,
-            accept_damaged=bool(args.accept_damaged),
-            progress=update,
-        )
-    for line in bag.describe():
-        terminal.note(f"{path}: {line}")
-    return Source(path, bag.data, np.arange(1, len(bag.data) + 1), "standstill", bag.frame_id)
-
-
-def _together(sources: Sequence[Source], *, given: bool) -> Measurements:
-    """One after the other; ``given``: the noise is stated, so the files' own does not matter."""
-    parts = [s.data for s in sources]
-    if len(parts) == 1:
-        return parts[0]
-    std = None
-    if not given:
-        without = [s.path for s in sources if s.data.std is None]
-        if without and len(without) < len(sources):
-            advice = "add them, or state the noise of all with --sigma or --instrument"
-            raise FileFormatError(without[0], "header", "no std_… columns", "them, as in other files", advice)
-        std = None if without else np.concatenate([np.asarray(d.std) for d in parts])
-    q, p = np.concatenate([d.q for d in parts]), np.concatenate([d.p for d in parts])
-    return Measurements(parts[0].joint_names, q, p, std)
-
-
 def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-# ── What ``identify`` may be told of noise, of the parameters beforehand and of what is wanted ──────────────
+# ── noise, prior knowledge and what is wanted ────────────────────────────────────────────────────────
 
 DEFAULTS = {name: field.default for name, field in IdentificationProblem.__dataclass_fields__.items()}
-TYPICAL = "typical"
 
 
 def add_noise(parser: argparse.ArgumentParser) -> None:
     """How the measurements may err, and how the fit is made."""
     group = parser.add_argument_group("how the measurements err")
     noise = group.add_mutually_exclusive_group()
-    noise.add_argument(
-        "--sigma", type=float, metavar="S", help="std of one coordinate [m] (the file's, else the residuals')"
-    )
-    noise.add_argument(
-        "--instrument",
-        metavar="FILE",
-        help="YAML: noise by direction (config/instruments/); the station is in the frame of the points",
-    )
-    group.add_argument(
-        "--loss",
-        choices=LOSSES,
-        default=DEFAULTS["loss"],
-        help="linear: every point counts; robust: points that do not fit are rejected, with the reason (linear)",
-    )
-    group.add_argument(
-        "--discrepancy",
-        choices=AUTOMATIC,
-        default=DEFAULTS["discrepancy"],
-        help="auto: residuals beyond the noise are what no geometric model holds; off: they are not (auto)",
-    )
-    group.add_argument(
-        "--joint-corrections",
-        choices=AUTOMATIC,
-        default=DEFAULTS["joint_corrections"],
-        help="auto: errors of the joints' transmissions are learnt where the data show them; off: never (auto)",
-    )
-    for name, text in (("iterations", "most iterations"), ("starts", "other starts, to meet other minima")):
-        value = DEFAULTS[name]
-        group.add_argument(f"--{name}", type=int, default=value, metavar="N", help=f"{text} ({value})")
+    text = "standard deviation of one coordinate [m] (the file's, else that of the residuals)"
+    option(noise, "--sigma", "S", text, kind=float)
+    text = "YAML: noise by direction (config/instruments/); the station is in the frame of the points"
+    option(noise, "--instrument", "FILE", text)
+    text = "linear: every point counts; robust: points that do not fit are rejected, with the reason"
+    option(group, "--loss", None, text, DEFAULTS["loss"], choices=LOSSES)
+    text = "auto: residuals beyond the noise count as errors that no geometric model holds; off: they do not"
+    option(group, "--discrepancy", None, text, DEFAULTS["discrepancy"], choices=AUTOMATIC)
+    add_joint_corrections(group, AUTOMATIC)
+    option(group, "--iterations", "N", "largest number of iterations", DEFAULTS["iterations"])
+    option(group, "--starts", "N", "number of other starts, which find other minima", DEFAULTS["starts"])
 
 
 def add_prior(parser: argparse.ArgumentParser) -> None:
     """What is known beforehand."""
     group = parser.add_argument_group("what is known beforehand")
-    group.add_argument(
-        "--prior",
-        metavar="FILE",
-        help=f"YAML of expected values and their std, or an earlier estimate (without its base and targets); "
-        f"{TYPICAL}: data sheet within usual manufacturing errors",
-    )
-    group.add_argument(
-        "--prior-includes",
-        choices=("tool",),
-        metavar="tool",
-        help="the reflectors sit where they did in the earlier estimate: take their places over too",
-    )
+    text = "YAML of expected values and their standard deviations, or an earlier estimate (without its base and "
+    text += f"targets); {TYPICAL}: the data sheet within usual manufacturing errors (none)"
+    option(group, "--prior", "FILE", text)
+    text = "the reflectors sit where they did in the earlier estimate: take their places over too"
+    option(group, "--prior-includes", "tool", text, choices=("tool",))
 
 
 def add_checks(parser: argparse.ArgumentParser) -> None:
     """How good it is and has to be."""
     check = parser.add_argument_group("how good is it")
     add_test_poses(check, "where the predicted accuracy is wanted")
-    check.add_argument("--required-accuracy", type=float, metavar="A", help="largest error that will do [m]")
-    check.add_argument(
-        "--validate", action="append", metavar="FILE", help="held-out CSV or bag; repeat for several"
-    )
-    check.add_argument(
-        "--validate-target-from",
-        type=int,
-        default=0,
-        metavar="N",
-        help="the reflector was re-seated: its offset comes from the first N rows of each held-out file",
-    )
-    check.add_argument(
-        "--folds", type=int, metavar="K", help="cross-validation: leave out each of K parts of --data in turn"
-    )
+    text = "largest error that is acceptable at a test pose [m] (not checked)"
+    option(check, "--required-accuracy", "A", text, kind=float)
+    option(check, "--validate", "FILE", "held-out CSV or bag; repeat for several", action="append")
+    text = "the reflector was re-seated: its offset comes from the first N rows of each held-out file"
+    option(check, "--validate-target-from", "N", text, 0)
+    text = "cross-validation: leave out each of K parts of --data in turn (none)"
+    option(check, "--folds", "K", text, kind=int)
     add_seed(check)
 
 
@@ -460,7 +301,7 @@ def prior_of(args: argparse.Namespace, robot: Robot, terminal: Terminal) -> Prio
             return None
         prior = typical_prior(robot)
         if prior is None:
-            terminal.note("No prior: it knows nothing of base and targets, and nothing else is asked for.")
+            terminal.note("No prior: it says nothing about base and targets, and nothing else is identified.")
         return prior
     file = read_prior(args.prior, robot, targets=args.prior_includes == "tool")
     if file.left_out:
@@ -481,24 +322,25 @@ def instrument_of(args: argparse.Namespace, terminal: Terminal) -> Noise | None:
     return noise
 
 
-# ── What ``identify`` writes: the estimate, and the calibrated robot as other programs take it ──────────────
+# ── outputs ──────────────────────────────────────────────────────────────────────────────────────────
 
-FLAGS = ("--output", "--report", "--urdf-output", "--kinematics-output")
+OUTPUTS = {
+    "--output": ("Estimate", "the estimate as YAML"),
+    "--report": ("Report", "one HTML page: verdict, accuracy, 3-D view, residuals"),
+    "--urdf-output": ("Calibrated URDF", "the calibrated URDF: the nominal one with its joints' origins changed"),
+    "--kinematics-output": (
+        "Kinematics",
+        "xyz and rpy per joint as YAML, as the driver of Universal Robots reads it",
+    ),
+}
+"""Option → what is written there, and its help."""
 
 
 def add_outputs(parser: argparse.ArgumentParser) -> None:
     """One option per kind of file."""
     group = parser.add_argument_group("what to write")
-    group.add_argument("--output", metavar="FILE", help="the estimate as YAML")
-    group.add_argument("--report", metavar="FILE", help="one HTML page: verdict, accuracy, 3-D view, residuals")
-    group.add_argument(
-        "--urdf-output", metavar="FILE", help="the calibrated URDF: the nominal one, its joints' origins changed"
-    )
-    group.add_argument(
-        "--kinematics-output",
-        metavar="FILE",
-        help="xyz and rpy per joint as YAML, as Universal Robots' driver reads it",
-    )
+    for flag, (_, text) in OUTPUTS.items():
+        option(group, flag, "FILE", text)
 
 
 def check_outputs(args: argparse.Namespace, robot: Robot) -> None:
@@ -507,9 +349,9 @@ def check_outputs(args: argparse.Namespace, robot: Robot) -> None:
     Raises:
         InputError: Two outputs of one name, a folder that is not there, no URDF to calibrate.
     """
-    taken: dict[Path, str] = {}
-    for flag, path in _wanted(args).items():
-        place = Path(path).expanduser().resolve()
+    taken: dict[Any, str] = {}
+    for flag, path in _outputs(args).items():
+        place = user_path(path).resolve()
         if place in taken:
             raise InputError(flag, path, f"another file than {taken[place]}")
         if not place.parent.is_dir():
@@ -520,43 +362,40 @@ def check_outputs(args: argparse.Namespace, robot: Robot) -> None:
 
 
 def write_outputs(args: argparse.Namespace, problem: IdentificationProblem, estimate: Estimate) -> dict[str, Any]:
-    """Write what is asked for; the answer's keys about it."""
+    """Write the files that the options name; the answer's keys about them."""
     robot = estimate.calibrated
     if args.output:
         write_estimate(args.output, estimate, "--output")
     if args.report:
-        write_report(args.report, problem, estimate, _provenance(args), "--report")
+        inputs = [("robot", args.robot), *(("data", f) for f in args.data)]
+        inputs += [("held out", f) for f in args.validate or ()]
+        command = shlex.join(["calib-planner", *sys.argv[1:]])
+        source = provenance(inputs, command=command, seed=args.seed, estimate=args.output or "")
+        write_report(args.report, problem, estimate, source, "--report")
     if args.urdf_output:
         write_calibrated_urdf(args.urdf_output, robot, field="--urdf-output")
     if args.kinematics_output:
         write_kinematics(args.kinematics_output, robot)
-    written: dict[str, Any] = {_key(flag): path for flag, path in _wanted(args).items()}
+    written: dict[str, Any] = {_key(flag): path for flag, path in _outputs(args).items()}
     if args.urdf_output or args.kinematics_output:
         written["not_written"] = list(not_in_origins(robot))
     return written
 
 
-def _provenance(args: argparse.Namespace) -> Provenance:
-    inputs = [("robot", args.robot), *(("data", f) for f in args.data)]
-    inputs += [("held out", f) for f in args.validate or ()]
-    command = shlex.join(["calib-planner", *sys.argv[1:]])
-    return provenance(inputs, command=command, seed=args.seed, estimate=args.output or "")
-
-
 def tell_outputs(args: argparse.Namespace, written: dict[str, Any], terminal: Terminal) -> None:
     """Say what was written and what has no place there."""
-    words = ("Estimate", "Report", "Calibrated URDF", "Kinematics")
-    for flag, word in zip(FLAGS, words, strict=True):
-        if _key(flag) in written:
-            terminal.note(f"{word} written to {written[_key(flag)]}")
+    for flag, path in _outputs(args).items():
+        terminal.note(f"{OUTPUTS[flag][0]} written to {path}")
     if written.get("not_written"):
         places = " and ".join(p for p in (args.urdf_output, args.kinematics_output) if p)
-        shown = ", ".join(grouped(written["not_written"]))
-        terminal.note(f"Not in {places}, which have no place for it: {shown} (tracker's frame and reflectors)")
+        names = ", ".join(grouped(written["not_written"]))
+        text = f"Not written to {places}, which cannot hold it: {names} (tracker's frame and reflectors)"
+        terminal.note(text)
 
 
-def _wanted(args: argparse.Namespace) -> dict[str, str]:
-    paths = {flag: getattr(args, _key(flag)) for flag in FLAGS}
+def _outputs(args: argparse.Namespace) -> dict[str, str]:
+    """Option → path of the files to be written."""
+    paths = {flag: getattr(args, _key(flag)) for flag in OUTPUTS}
     return {flag: path for flag, path in paths.items() if path}
 
 

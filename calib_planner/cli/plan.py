@@ -11,22 +11,27 @@ from rich.console import Console
 from rich.table import Table
 
 from calib_planner.cli.arguments import (
+    TYPICAL,
     Commands,
+    Group,
     add_command,
     add_conditions,
     add_parameters,
     add_robot,
     add_seed,
+    add_test_path,
     add_test_poses,
     choose_parameters,
     conditions,
     load_robot,
     numbers,
+    option,
+    require_test_poses,
+    switch,
     test_poses,
 )
-from calib_planner.cli.identify import TYPICAL
-from calib_planner.cli.sheet import robot_pace, write_sheet
-from calib_planner.cli.terminal import Terminal
+from calib_planner.cli.sheet import tell_sheet
+from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.errors import InputError
 from calib_planner.identification import typical_prior
 from calib_planner.io import (
@@ -34,6 +39,7 @@ from calib_planner.io import (
     read_configurations,
     read_measurements,
     read_prior,
+    robot_pace,
     write_configurations,
     write_plan,
 )
@@ -67,17 +73,14 @@ def add(commands: Commands, summary: str) -> None:
     parser = add_command(commands, "plan", summary, run, EXAMPLE)
     work = add_problem(parser, any_criterion=True)
     size = work.add_mutually_exclusive_group(required=True)
-    size.add_argument("--configurations", type=int, metavar="M", help="how many different ones")
-    size.add_argument(
-        "--measurements", type=int, metavar="N", help="in all; how many different ones is found out"
-    )
-    size.add_argument(
-        "--accuracy", type=float, metavar="A", help="the fewest measurements that reach this ρ0 [m]"
-    )
-    work.add_argument("--repetitions", type=int, metavar="K", help="measurements at each of M (1)")
-    parser.add_argument("--prove", action="store_true", help="make the bound rigorous, by branch and bound")
-    parser.add_argument("--output", metavar="FILE", help="write the plan: .yaml, or .csv for a table")
-    parser.add_argument("--sheet", metavar="DIR", help="write the sheet for the person at the robot, see sheet")
+    option(size, "--configurations", "M", "number of different configurations", kind=int)
+    text = "number of measurements in all; the program chooses the number of different configurations"
+    option(size, "--measurements", "N", text, kind=int)
+    option(size, "--accuracy", "A", "take the fewest measurements that reach this ρ0 [m]", kind=float)
+    option(work, "--repetitions", "K", "number of measurements at each configuration (1)", kind=int)
+    switch(parser, "--prove", "make the bound rigorous, by branch and bound")
+    option(parser, "--output", "FILE", "write the plan: .yaml, or .csv for a table")
+    option(parser, "--sheet", "DIR", "write the sheet for the person at the robot, see sheet")
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
@@ -98,18 +101,20 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             split = plan_for_accuracy(problem, args.accuracy, watch=watch)
         elif args.measurements is not None:
             split = split_budget(problem, args.measurements, watch=watch)
-        found = split.plan if split else find_plan(problem, report, prove=args.prove)
+        plan = split.plan if split else find_plan(problem, report, prove=args.prove)
     if args.output:
-        _write(args.output, found)
+        _write(args.output, plan)
     if args.sheet:
-        sheet = plan_sheet(
-            found, problem.robot, problem.constraints, problem.instrument, pace=robot_pace(problem.robot)
-        )
-        write_sheet(args.sheet, sheet, terminal, "--sheet")
-    result = found.to_dict() | (_tried(split) if split else {})
+        # 0.1 s for templates, which only a sheet waits for.
+        from calib_planner.report import write_sheet
+
+        pace = robot_pace(problem.robot)
+        sheet = plan_sheet(plan, problem.robot, problem.constraints, problem.instrument, pace=pace)
+        tell_sheet(write_sheet(args.sheet, sheet, "--sheet"), terminal)
+    result = plan.to_dict() | (_tried(split) if split else {})
     result |= {"output": args.output} if args.output else {}
     result |= {"sheet": args.sheet} if args.sheet else {}
-    terminal.answer(result, partial(show_plan, found, problem.robot))
+    terminal.answer(result, partial(show_plan, plan, problem.robot))
     if split and not args.json:
         terminal.answer({}, partial(show_tried, split))
     if args.output:
@@ -122,7 +127,7 @@ def _best(progress: Progress, criterion: str) -> str:
     if not progress.starts_done:
         return ""
     if criterion in ("test_pose", "worst_pose"):
-        return f"best ρ0 {1e3 * progress.best_accuracy:.4f} mm"
+        return f"best ρ0 {length(progress.best_accuracy)}"
     return f"best value {progress.best_accuracy:.4g}"
 
 
@@ -150,14 +155,14 @@ def _check(args: argparse.Namespace) -> None:
         make_folder(args.sheet, "--sheet")  # refused before the search, not after it
 
 
-def _write(output: str, found: Plan) -> None:
+def _write(output: str, plan: Plan) -> None:
     if output.lower().endswith(".csv"):
-        write_configurations(output, found.joint_names, found.configurations, found.repetitions, field="--output")
+        write_configurations(output, plan.joint_names, plan.configurations, plan.repetitions, field="--output")
     else:
-        write_plan(output, found, "--output")
+        write_plan(output, plan, "--output")
 
 
-# ── The arguments that make a plan problem, shared by ``plan`` and ``compare`` ──────────────────────────────
+# ── the arguments that make a plan problem, shared by ``plan`` and ``compare`` ─────────────────────────
 
 USUAL = Search()
 
@@ -168,73 +173,38 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     add_parameters(parser)
     wanted = parser.add_argument_group("where accuracy matters")
     add_test_poses(wanted, "where accuracy matters")
-    wanted.add_argument(
-        "--test-path", metavar="FILE", help="CSV with a column per joint; every row is a test pose"
-    )
-    wanted.add_argument("--weights", type=numbers, metavar='"w1 …"', help="one per test pose (equal)")
+    add_test_path(wanted)
+    option(wanted, "--weights", '"w1 …"', "weight of each test pose (equal)", kind=numbers)
     if any_criterion:
         _add_criteria(wanted)
     work = parser.add_argument_group("what may be measured")
     add_conditions(work)
-    work.add_argument(
-        "--configuration-sigma",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="error of one coordinate that repeating a configuration does not average away [m] (0)",
-    )
+    text = "error of one coordinate that repeating a configuration does not average away [m]"
+    option(work, "--configuration-sigma", "S", text, 0.0)
     known = parser.add_argument_group("what is known beforehand")
-    known.add_argument(
-        "--prior",
-        metavar="FILE",
-        help="YAML: parameter name to standard deviation [m | rad], or a prior as for identify, but no estimate; "
-        f"{TYPICAL}: the data sheet within usual manufacturing errors",
-    )
-    known.add_argument("--measured", metavar="FILE", help="CSV of measurements already taken: plan the next ones")
+    text = "YAML: parameter name to standard deviation [m | rad], or a prior as for identify, but no estimate; "
+    text += f"{TYPICAL}: the data sheet within usual manufacturing errors (none)"
+    option(known, "--prior", "FILE", text)
+    option(known, "--measured", "FILE", "CSV of measurements already taken: plan the next ones")
     search = parser.add_argument_group("search")
-    search.add_argument(
-        "--general-weight",
-        type=float,
-        default=USUAL.general_weight,
-        metavar="W",
-        help="share of the criterion for accuracy everywhere, 0 … 1 "
-        f"({USUAL.general_weight:g}; 0 is the paper's)",
-    )
-    search.add_argument(
-        "--starts", type=int, default=USUAL.starts, metavar="N", help=f"random starts ({USUAL.starts})"
-    )
-    search.add_argument("--time-limit", type=float, default=float("inf"), metavar="S", help="seconds (none)")
+    text = "share of the criterion for accuracy everywhere, 0 … 1; 0 is the paper's"
+    option(search, "--general-weight", "W", text, USUAL.general_weight)
+    option(search, "--starts", "N", "number of random starts", USUAL.starts)
+    option(search, "--time-limit", "S", "time after which the search ends [s]", float("inf"))
     add_seed(search)
     return work
 
 
-def _add_criteria(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--criterion",
-        choices=CRITERIA,
-        default="test_pose",
-        help="what is best: accuracy at the test poses (rms or worst), or a criterion of the literature",
-    )
-    group.add_argument(
-        "--compound",
-        action="append",
-        default=[],
-        metavar="NAME=SHARE",
-        help="mix in the efficiency by another criterion with this share (below 1); repeat for several",
-    )
-    group.add_argument(
-        "--candidates", metavar="FILE", help="CSV of joint configurations to choose from, one per row"
-    )
-    group.add_argument(
-        "--discrepancy",
-        choices=("auto", "on", "off"),
-        default="auto",
-        help="expect the systematic errors of a real robot when choosing candidates; auto: for robots from a "
-        "URDF; off: the paper's white noise alone",
-    )
-    group.add_argument(
-        "--repeat-candidates", action="store_true", help="a candidate may be chosen more than once"
-    )
+def _add_criteria(group: Group) -> None:
+    text = "what is best: accuracy at the test poses (rms or worst), or a criterion of the literature"
+    option(group, "--criterion", None, text, "test_pose", choices=CRITERIA)
+    text = "mix in the efficiency by another criterion with this share (below 1); repeat for several"
+    group.add_argument("--compound", action="append", default=[], metavar="NAME=SHARE", help=text)
+    option(group, "--candidates", "FILE", "CSV of joint configurations to choose from, one per row")
+    text = "expect the systematic errors of a real robot when choosing candidates; auto: for robots from a URDF; "
+    text += "off: only the paper's white noise"
+    option(group, "--discrepancy", None, text, "auto", choices=("auto", "on", "off"))
+    switch(group, "--repeat-candidates", "a candidate may be chosen more than once")
 
 
 def make_problem(args: argparse.Namespace, configurations: int, repetitions: int = 1) -> PlanProblem:
@@ -244,11 +214,9 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         InputError: Names the option at fault.
     """
     robot = choose_parameters(load_robot(args), args)
-    poses = test_poses(robot, args)
-    criterion = getattr(args, "criterion", "test_pose")
-    if poses is None and criterion in POSE_CRITERIA:
-        wanted = f"{len(robot.joint_names)} numbers: {', '.join(robot.joint_names)}"
-        raise InputError("--test-pose", "none", wanted, "give --test-pose or --test-path")
+    poses, criterion = test_poses(robot, args), getattr(args, "criterion", "test_pose")
+    if criterion in POSE_CRITERIA:
+        require_test_poses(robot, poses)
     candidates, compound = _candidates(args, robot), _compound(getattr(args, "compound", []))
     wanted = getattr(args, "discrepancy", "off")
     discrepancy = ModelDiscrepancy() if wanted == "on" else None
@@ -312,7 +280,7 @@ def _candidates(args: argparse.Namespace, robot: Robot) -> Candidates | None:
     return Candidates(rows, args.repeat_candidates)
 
 
-# ── A plan for people: what it promises first, then the configurations ──────────────────────────────────────
+# ── a plan for people: what it promises first, then the configurations ─────────────────────────────────────
 
 
 def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
@@ -326,7 +294,8 @@ def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
             f"with σ = {length(plan.sigma)}."
         )
     console.print(_bound(plan))
-    console.print(_configurations(plan, robot))
+    title = "configurations, in the order of measuring"
+    console.print(configurations_table(title, robot, plan.configurations, plan.repetitions.tolist()))
     if len(plan.test_poses) > 1:
         per = ", ".join(length(v) for v in quality.predicted_accuracy_per_test_pose)
         console.print(f"ρ0 per test pose: {per}")
@@ -369,15 +338,3 @@ def show_tried(split: Split, console: Console) -> None:
     console.print(table)
     if split.fewest:
         console.print(f"No plan of fewer than {split.fewest} measurements can reach it.")
-
-
-def _configurations(plan: Plan, robot: Robot) -> Table:
-    table = Table(title="configurations, in the order of measuring")
-    table.add_column("#", justify="right")
-    for name, turns in zip(plan.joint_names, robot.joint_is_revolute, strict=True):
-        table.add_column(f"{name}\n[{'°' if turns else 'mm'}]", justify="right")
-    table.add_column("measure", justify="right")
-    factors = np.where(robot.joint_is_revolute, 180.0 / np.pi, 1e3)
-    for i, (row, times) in enumerate(zip(plan.configurations * factors, plan.repetitions, strict=True), 1):
-        table.add_row(str(i), *(f"{v:.2f}" for v in row), f"{times}×")
-    return table

@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from calib_planner.arrays import plain
-from calib_planner.cli.arguments import Commands, add_command, add_seed
+from calib_planner.cli.arguments import Commands, add_command, add_links, add_seed
 from calib_planner.cli.terminal import Terminal
 from calib_planner.io import shipped_robots
 from calib_planner.robot import Robot
+from calib_planner.units import joint_unit, joint_value, milli
 
 EXAMPLE = "calib-planner robots show kuka_kr270"
 
@@ -33,16 +33,15 @@ def add(commands: Commands, summary: str) -> None:
         "Show a robot's joints, parameters (the names for --parameters) and targets.\n"
         "Shown in degrees and mm; with --json in radians and m.",
     )
-    show.add_argument("robot", metavar="R", help="shipped name, robot YAML or URDF")
-    show.add_argument("--base-link", metavar="LINK", help="first link of the chain in a URDF (its root)")
-    show.add_argument("--tip-link", metavar="LINK", help="last link of the chain in a URDF (its only leaf)")
+    show.add_argument("robot", metavar="R", help="name of a shipped robot, robot YAML or URDF")
+    add_links(show)
 
 
 def run_list(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work of list."""
-    found = [Robot.load(name) for name in shipped_robots()]
+    robots = [Robot.load(name) for name in shipped_robots()]
     rows: list[dict[str, Any]] = [
-        {"name": r.name, "joints": len(r.joint_names), "parameters": list(r.parameter_names)} for r in found
+        {"name": r.name, "joints": len(r.joint_names), "parameters": list(r.parameter_names)} for r in robots
     ]
 
     def show(console: Console) -> None:
@@ -84,15 +83,14 @@ def _show(robot: Robot, console: Console) -> None:
     joints.add_column("lower", justify="right")
     joints.add_column("upper", justify="right")
     for name, turns, limits in zip(robot.joint_names, robot.joint_is_revolute, robot.joint_limits, strict=True):
-        shown = np.degrees(limits) if turns else 1e3 * limits
-        joints.add_row(name, "°" if turns else "mm", *(f"{v:.2f}" for v in shown))
+        joints.add_row(name, joint_unit(turns), *(joint_value(v, turns) for v in limits))
     console.print(joints)
     parameters = Table("parameter", "unit", "levels", title="parameters unless --parameters says otherwise")
     parameters.add_column("nominal", justify="right")
     for p in robot.parameters:
         levels = [k for k, names in robot.levels.items() if p.name in names]
         unit = "mm" if p.unit == "m" else "mrad"
-        parameters.add_row(p.name, unit, ", ".join(levels), f"{1e3 * p.nominal:.4f}")
+        parameters.add_row(p.name, unit, ", ".join(levels), milli(p.nominal))
     console.print(parameters)
     levels = [f"{k} ({len(names)})" for k, names in robot.levels.items() if names]
     console.print(f"Levels for --parameters: {', '.join(levels)}")

@@ -3,74 +3,54 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray, check_number, plain
-from calib_planner.cli.arguments import Commands, add_command, add_robot, load_robot, numbers
+from calib_planner.arrays import check_number, plain
+from calib_planner.cli.arguments import Commands, add_command, add_robot, joint_rows, load_robot, numbers, option
 from calib_planner.cli.terminal import Terminal
-from calib_planner.errors import FileFormatError, InputError
+from calib_planner.errors import FileFormatError
 from calib_planner.io import (
-    URDF_SUFFIXES,
+    SHARE,
+    SHEET_FILES,
     WORDS,
-    angle_factors,
-    make_folder,
     read_constraints,
     read_instrument,
     read_plan,
-    read_speed_limits,
-    write_sheet_csv,
-    write_sheet_yaml,
-    write_trajectory,
+    robot_pace,
 )
-from calib_planner.planning import DWELL, Pace, PlanSheet, plan_sheet, usual_pace
-from calib_planner.report import write_sheet_page
+from calib_planner.planning import DWELL, Pace, PlanSheet, plan_sheet
 from calib_planner.robot import Robot
 from calib_planner.units import duration, length, signed
 
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --configurations 6 \\
       --constraints config/constraints.yaml --output plan.yaml
   calib-planner sheet --plan plan.yaml --constraints config/constraints.yaml --output sheet"""
-SHARE = 0.25
-FILES = ("plan_sheet.html", "plan_sheet.csv", "plan_sheet.yaml", "trajectory.yaml")
 
 
 def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     text = (
-        "Everything a person at the robot needs to measure a plan: with --output a printable page, CSV, YAML and "
+        "Write everything that a person at the robot needs to measure a plan: with --output a printable page,\n"
     )
-    text += "a trajectory_msgs/JointTrajectory as YAML.\nWhat was not checked is called so."
+    text += "CSV, YAML and a trajectory_msgs/JointTrajectory as YAML. The sheet says what was not checked."
     parser = add_command(commands, "sheet", summary, run, EXAMPLE, text)
-    parser.add_argument("--plan", required=True, metavar="FILE", help="plan .yaml, of plan --output")
+    option(parser, "--plan", "FILE", "plan .yaml, written by plan --output", required=True)
     add_robot(parser, "the plan's, if it is a shipped one")
     known = parser.add_argument_group("what is to be checked")
-    known.add_argument("--constraints", metavar="FILE", help="YAML: the plan's constraints, or others")
-    known.add_argument(
-        "--instrument", metavar="FILE", help="YAML: where the tracker stands, if constraints do not say"
-    )
+    option(known, "--constraints", "FILE", "YAML: the plan's constraints, or others")
+    option(known, "--instrument", "FILE", "YAML: where the tracker stands, if the constraints do not say")
     time = parser.add_argument_group("travel and time")
-    time.add_argument(
-        "--start", type=numbers, metavar='"q1 … qn"', help="where the robot stands before [rad | m]"
-    )
+    option(time, "--start", '"q1 … qn"', "where the robot stands before the first visit [rad | m]", kind=numbers)
     speed = time.add_mutually_exclusive_group()
-    speed.add_argument("--speed", type=float, metavar="V", help="of every joint, at most [rad/s | m/s]")
-    speed.add_argument(
-        "--speed-share",
-        type=float,
-        default=SHARE,
-        metavar="F",
-        help=f"share of the URDF's speed limits, 0 … 1 ({SHARE:g}; 0.5 rad/s, 0.1 m/s without limits)",
-    )
-    time.add_argument(
-        "--dwell", type=float, default=DWELL, metavar="S", help=f"standstill per measurement [s] ({DWELL:g})"
-    )
-    parser.add_argument("--output", metavar="DIR", help=f"folder for {', '.join(FILES)}")
+    option(speed, "--speed", "V", "largest speed of every joint [rad/s | m/s]", kind=float)
+    text = "share of the speed limits in the URDF, 0 … 1; 0.5 rad/s and 0.1 m/s without limits"
+    option(speed, "--speed-share", "F", text, SHARE)
+    option(time, "--dwell", "S", "time at standstill for each measurement [s]", DWELL)
+    option(parser, "--output", "DIR", f"folder for {', '.join(SHEET_FILES)}")
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
@@ -87,46 +67,28 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         () if args.constraints is None else read_constraints(args.constraints, robot),
         None if args.instrument is None else read_instrument(args.instrument),
         pace=_pace(robot, args),
-        start=_start(robot, args),
+        start=None if args.start is None else joint_rows("--start", [args.start], robot, args)[0],
     )
-    written = write_sheet(args.output, sheet, terminal) if args.output else []
+    written: list[str] = []
+    if args.output:
+        from calib_planner.report import write_sheet  # 0.1 s for templates, which only a sheet waits for
+
+        written = write_sheet(args.output, sheet, "--output")
+        tell_sheet(written, terminal)
     result = sheet.to_dict() | ({"output": args.output, "files": written} if args.output else {})
     terminal.answer(plain(result), partial(show_sheet, sheet))
     if written:
         terminal.note(f"In {args.output}: {', '.join(written)}")
 
 
-def write_sheet(folder: str, sheet: PlanSheet, terminal: Terminal, field: str = "--output") -> list[str]:
-    """Write all files of a sheet into ``folder``; returns their names.
-
-    No trajectory is written to a stop that is not reachable; an older one in the folder is removed.
-
-    Raises:
-        InputError: The folder cannot be made or written to; names ``field``.
-    """
-    target, reachable = make_folder(folder, field), bool(sheet.checks.reachable.all())
-    if not reachable:
-        (target / FILES[3]).unlink(missing_ok=True)
-    writers = (write_sheet_page, write_sheet_csv, write_sheet_yaml, write_trajectory)
-    written = FILES if reachable else FILES[:3]
-    for name, write in zip(written, writers, strict=False):
-        write(target / name, sheet, field)
-    if len(written) < len(FILES):
-        terminal.note("No trajectory was written: not every stop is reachable.")
-    return list(written)
-
-
-def robot_pace(robot: Robot, dwell: float = DWELL, share: float = SHARE) -> Pace:
-    """A share of the speed limits in the robot's URDF, or assumed speeds where there are none."""
-    usual, path = usual_pace(robot, dwell), Path(robot.source)
-    limits = read_speed_limits(path, robot.joint_names) if path.suffix.lower() in URDF_SUFFIXES else None
-    if limits is None:
-        return usual
-    return replace(usual, speeds=share * limits, origin=f"at most {share:.3g} of the URDF's speed limits")
+def tell_sheet(written: list[str], terminal: Terminal) -> None:
+    """Say so if the sheet came without its trajectory."""
+    if len(written) < len(SHEET_FILES):
+        terminal.note("No trajectory was written: not every configuration is reachable.")
 
 
 def _pace(robot: Robot, args: argparse.Namespace) -> Pace:
-    """Speeds as asked for, or the robot's."""
+    """Speeds as the options say, or the robot's."""
     dwell = check_number("--dwell", args.dwell, low=0, high=86_400, unit="s")
     if args.speed is not None:
         speed = check_number("--speed", args.speed, low=0, low_open=True, high=100.0, unit="rad/s or m/s")
@@ -135,18 +97,7 @@ def _pace(robot: Robot, args: argparse.Namespace) -> Pace:
     return robot_pace(robot, dwell, share)
 
 
-def _start(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
-    if args.start is None:
-        return None
-    if len(args.start) != len(robot.joint_names):
-        wanted = f"{len(robot.joint_names)} numbers: {', '.join(robot.joint_names)}"
-        raise InputError("--start", f"{len(args.start)} numbers", wanted)
-    if not np.isfinite(args.start).all():
-        raise InputError("--start", "a number that is not finite", "finite numbers", "correct that number")
-    return np.array(args.start) * angle_factors(robot, degrees=args.degrees)
-
-
-# ── A plan sheet for the terminal: what the plan promises, its stops, what was checked and what not ─────────
+# ── a plan sheet for the terminal: what the plan promises, its visits, what was checked and what not ───────
 
 
 def show_sheet(sheet: PlanSheet, console: Console) -> None:

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from calib_planner.arrays import FloatArray, IntArray, check_count, check_number, plain
 from calib_planner.cli.arguments import (
+    SIGMA,
     Commands,
     add_command,
     add_parameters,
@@ -18,6 +19,7 @@ from calib_planner.cli.arguments import (
     add_seed,
     choose_parameters,
     load_robot,
+    option,
 )
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import FileFormatError, InputError
@@ -30,6 +32,7 @@ from calib_planner.simulation import (
     independent_seeds,
     random_deviations,
 )
+from calib_planner.units import signed
 
 EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7 --output measured.csv
   calib-planner identify --robot kuka_kr270 --data measured.csv"""
@@ -40,40 +43,17 @@ def add(commands: Commands, summary: str) -> None:
     parser = add_command(commands, "simulate", summary, run, EXAMPLE)
     add_robot(parser)
     add_parameters(parser)
-    parser.add_argument(
-        "--plan",
-        required=True,
-        metavar="FILE",
-        help="plan .yaml, or a .csv with a column per joint and optionally one named repetitions",
-    )
-    parser.add_argument("--repetitions", type=int, metavar="K", help="measurements at each (the plan's)")
+    text = "plan .yaml, or a .csv with a column per joint and optionally one named repetitions"
+    option(parser, "--plan", "FILE", text, required=True)
+    option(parser, "--repetitions", "K", "number of measurements at each configuration (the plan's)", kind=int)
     truth = parser.add_argument_group("the true robot")
-    truth.add_argument(
-        "--true",
-        action="append",
-        type=assignment,
-        metavar="NAME=VALUE",
-        help="true deviation from nominal [m | rad]; repeat; no others then (drawn from the seed)",
-    )
-    truth.add_argument(
-        "--length-error",
-        type=float,
-        default=LENGTH_ERROR,
-        metavar="S",
-        help=f"std of drawn length errors [m] ({LENGTH_ERROR:g})",
-    )
-    truth.add_argument(
-        "--angle-error",
-        type=float,
-        default=ANGLE_ERROR,
-        metavar="S",
-        help=f"std of drawn angle errors [rad] ({ANGLE_ERROR:g})",
-    )
-    truth.add_argument(
-        "--sigma", type=float, default=3e-5, metavar="S", help="tracker's std of one coordinate [m] (3e-5)"
-    )
+    text = "true deviation from nominal [m | rad]; repeat; no others then (drawn from the seed)"
+    option(truth, "--true", "NAME=VALUE", text, kind=assignment, action="append")
+    option(truth, "--length-error", "S", "standard deviation of drawn length errors [m]", LENGTH_ERROR)
+    option(truth, "--angle-error", "S", "standard deviation of drawn angle errors [rad]", ANGLE_ERROR)
+    option(truth, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", SIGMA)
     add_seed(truth)
-    parser.add_argument("--output", metavar="FILE", help="CSV of measurements (stdout without --json)")
+    option(parser, "--output", "FILE", "CSV of measurements (stdout without --json)")
 
 
 def assignment(text: str) -> tuple[str, float]:
@@ -150,7 +130,7 @@ def _show(result: dict[str, Any], console: Console) -> None:
     table.add_column("deviation", justify="right")
     for row in result["true"]:
         unit = "mm" if row["unit"] == "m" else "mrad"
-        table.add_row(row["name"], unit, f"{1e3 * row['deviation']:+.4f}")
+        table.add_row(row["name"], unit, signed(1e3 * row["deviation"], 4, plus=True))
     console.print(table)
     where = f" written to {result['output']}" if result["output"] else ""
     console.print(f"{result['measurements']} measurements{where}, seed {result['seed']}")

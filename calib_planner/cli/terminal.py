@@ -6,12 +6,19 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from calib_planner.units import joint_unit, joint_value
+
+if TYPE_CHECKING:
+    from calib_planner.arrays import FloatArray
+    from calib_planner.robot import Robot
 
 PATIENCE = 1.0
 """Work shorter than this shows no progress [s]."""
@@ -105,3 +112,16 @@ class _Console(Console):
 def _console(stream: Any) -> Console:
     width = None if stream.isatty() else WIDTH
     return _Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
+
+
+def configurations_table(title: str, robot: Robot, q: FloatArray, times: Sequence[int]) -> Table:
+    """Configurations (m, joints) [rad | m] in degrees and millimetres, and how often each is measured."""
+    table = Table(title=title)
+    table.add_column("#", justify="right")
+    for name, turns in zip(robot.joint_names, robot.joint_is_revolute, strict=True):
+        table.add_column(f"{name}\n[{joint_unit(turns)}]", justify="right")
+    table.add_column("measure", justify="right")
+    for i, (row, count) in enumerate(zip(q.tolist(), times, strict=True), 1):
+        values = (joint_value(v, t) for v, t in zip(row, robot.joint_is_revolute, strict=True))
+        table.add_row(str(i), *values, f"{count}×")
+    return table

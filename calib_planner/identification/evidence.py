@@ -75,8 +75,8 @@ def estimate_of(evidence: Evidence) -> Estimate:
     predicted = evidence.equations.motion.at(fit.deviations)[0]
     residuals = data.p - predicted
     before = data.p - _placed_positions(evidence)
-    fixed = [i for i in evidence.identifiability.held if i not in evidence.resolved]
-    combination = dict(zip(evidence.identifiability.held, evidence.identifiability.combinations, strict=True))
+    fixed = [i for i in evidence.identifiability.fixed if i not in evidence.resolved]
+    combination = dict(zip(evidence.identifiability.fixed, evidence.identifiability.combinations, strict=True))
     status = "not_converged" if not fit.converged else "rank_deficient" if fixed else "ok"
     estimate = Estimate(
         calibrated=robot.with_deviations(dict(zip(names, fit.deviations, strict=True))),
@@ -199,7 +199,7 @@ def _accuracy(evidence: Evidence, poses: FloatArray) -> Accuracy:
 
 def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
     """(K,) whether a pose moves with a combination that was held because hardly any measured point does."""
-    held = [k for k, i in enumerate(evidence.identifiability.held) if i not in evidence.resolved]
+    held = [k for k, i in enumerate(evidence.identifiability.fixed) if i not in evidence.resolved]
     if not held:
         return np.zeros(len(poses), bool)
     directions = evidence.identifiability.directions[held].T

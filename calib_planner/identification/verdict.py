@@ -1,6 +1,6 @@
 """Is this calibration good? PASS, WARN or FAIL, with reasons that a person can act on.
 
-Every reason has a level of its own; the verdict is the worst of them. A reason at level PASS is worth knowing and
+Every reason has a level of its own; the verdict is the worst of them. A reason at level PASS is information and
 needs no action. The verdict follows from the numbers of the estimate alone.
 
 ``RULES`` is the table of everything that ``judge`` can say: code, text, and what to do at each level that the

@@ -63,7 +63,7 @@ class Work:
         jacobian = motion.at(at)[1]
         found = analyse(jacobian[use].reshape(-1, len(names)), names)
         labels = configuration_labels(data.q)
-        work = Work(problem, motion, use, instrument, source, labels, at, jacobian, found, found.kept)
+        work = Work(problem, motion, use, instrument, source, labels, at, jacobian, found, found.free)
         return replace(work, kept=work._with_prior(work.unit, np.zeros(len(names))))
 
     def told_by(self, use: NDArray[np.bool_]) -> Work:
@@ -71,7 +71,7 @@ class Work:
         names, at = self.robot.parameter_names, np.zeros(len(self.robot.parameter_names))
         jacobian = self.motion.at(at)[1]
         found = analyse(jacobian[use].reshape(-1, len(names)), names)
-        work = replace(self, use=use, at=at, jacobian=jacobian, identifiability=found, kept=found.kept)
+        work = replace(self, use=use, at=at, jacobian=jacobian, identifiability=found, kept=found.free)
         return replace(work, kept=work._with_prior(work.unit, at))
 
     @property
@@ -82,7 +82,7 @@ class Work:
     @property
     def lengths(self) -> FloatArray:
         """(kept,) what each parameter kept adds to its predecessors, by the data or the prior [m per unit]."""
-        own = dict(zip(self.identifiability.kept, self.identifiability.lengths, strict=True))
+        own = dict(zip(self.identifiability.free, self.identifiability.lengths, strict=True))
         return np.array([own.get(k, np.inf) for k in self.kept])
 
     @property
@@ -103,22 +103,22 @@ class Work:
             return self
         jacobian = self.motion.at(deviations)[1]
         # What could not be told apart before stays held, though it may differ a little here.
-        held = np.isin(np.arange(len(names)), self.identifiability.held)
+        held = np.isin(np.arange(len(names)), self.identifiability.fixed)
         rows = jacobian[self.use].reshape(-1, len(names))
         found = analyse(rows, names, shortest=np.where(held, np.inf, shortest))
-        there = replace(self, at=deviations, jacobian=jacobian, identifiability=found, kept=found.kept)
+        there = replace(self, at=deviations, jacobian=jacobian, identifiability=found, kept=found.free)
         held = ~np.isin(np.arange(len(names)), self.kept)
         return replace(there, kept=there._with_prior(sigma, np.where(held, np.inf, shortest)))
 
     def _with_prior(self, sigma: float, shortest: FloatArray) -> tuple[int, ...]:
         """Parameters that the data or the prior can tell."""
         names, prior = self.robot.parameter_names, self.problem.prior
-        if prior is None or not self.identifiability.held:
-            return self.identifiability.kept
+        if prior is None or not self.identifiability.fixed:
+            return self.identifiability.free
         # A prior is worth as many metres of the points as their scatter leaves undecided.
         rows = sigma * prior.rows(names, np.zeros(len(names)))[0]
         seen = self.jacobian[self.use].reshape(-1, len(names))
-        return analyse(np.vstack([seen, rows]), names, shortest=shortest).kept
+        return analyse(np.vstack([seen, rows]), names, shortest=shortest).free
 
     def equations(self, use: NDArray[np.bool_], covariance: FloatArray) -> Equations:
         """Point by point, under ``covariance`` (N, targets, 3, 3)."""

@@ -26,7 +26,16 @@ if TYPE_CHECKING:
     from calib_planner.io.kinematics import write_kinematics
     from calib_planner.io.plan import read_plan, write_plan
     from calib_planner.io.prior import read_prior
-    from calib_planner.io.sheet import WORDS, write_sheet_csv, write_sheet_yaml, write_trajectory
+    from calib_planner.io.sheet import (
+        SHARE,
+        SHEET_FILES,
+        WORDS,
+        robot_pace,
+        write_sheet_csv,
+        write_sheet_yaml,
+        write_trajectory,
+    )
+    from calib_planner.io.sources import Sources, SourceSettings, read_source, read_sources
     from calib_planner.io.store import (
         ACCEPTED,
         KEPT,
@@ -41,7 +50,7 @@ if TYPE_CHECKING:
         open_store,
         stored_model,
     )
-    from calib_planner.io.text import make_folder, read_text, write_text
+    from calib_planner.io.text import make_folder, read_text, user_path, write_text
     from calib_planner.io.urdf import (
         calibrated_urdf,
         parse_speed_limits,
@@ -63,10 +72,11 @@ __getattr__, __dir__, __all__ = lazy_door(
         "kinematics": "write_kinematics",
         "plan": "read_plan write_plan",
         "prior": "read_prior",
-        "sheet": "WORDS write_sheet_csv write_sheet_yaml write_trajectory",
+        "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
+        "sources": "Sources SourceSettings read_source read_sources",
         "store": "ACCEPTED KEPT LONGEST OUTLIER UNDONE CampaignStore Decision StoredCampaign "
         "StoredModel UnavailableStore open_store stored_model",
-        "text": "make_folder read_text write_text",
+        "text": "make_folder read_text user_path write_text",
         "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
         "write_calibrated_urdf",
     },

@@ -28,7 +28,7 @@ from calib_planner.campaign import (
     CampaignProblem,
     CampaignState,
     Exclusion,
-    Row,
+    Measurement,
     from_measurements,
 )
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, StoreError
@@ -54,10 +54,12 @@ class Journal:
             StoreError: It cannot be written.
         """
         lines: list[dict[str, Any]] = []
-        if [s.role for s in before.stops] != [s.role for s in after.stops[: len(before.stops)]]:
+        if [s.role for s in before.configurations] != [
+            s.role for s in after.configurations[: len(before.configurations)]
+        ]:
             lines.append({"joined": True})
-        now = {r.number: r for r in after.rows}
-        then = {r.number: r for r in before.rows}
+        now = {r.number: r for r in after.measurements}
+        then = {r.number: r for r in before.measurements}
         lines += [{"withdrawn": number} for number in then if number not in now]
         lines += [_row_line(after, r) for number, r in now.items() if then.get(number) is not r]
         lines += [_exclusion_line(e) for e in after.exclusions[len(before.exclusions) :]]
@@ -106,8 +108,10 @@ class Stored:
         parts = [[r for r in ordered if (r[1] == FIT) == own] for own in (True, False)]
         data = [_measurements(problem.robot, part) for part in parts]
         state = from_measurements(problem, data[0], data[1], self.exclusions)
-        rows: list[Row] = [replace(r, number=o[0]) for r, o in zip(state.rows, ordered, strict=True)]
-        return replace(state, rows=tuple(rows))
+        measurements: list[Measurement] = [
+            replace(r, number=o[0]) for r, o in zip(state.measurements, ordered, strict=True)
+        ]
+        return replace(state, measurements=tuple(measurements))
 
 
 def begin_journal(folder: str | Path, campaign_id: str, robot: Robot) -> Journal:
@@ -192,14 +196,14 @@ def _measurements(robot: Robot, rows: list[tuple[int, str, list[float], list[Any
     return Measurements(robot.joint_names, np.array([r[2] for r in rows], float), points)
 
 
-def _row_line(state: CampaignState, row: Row) -> dict[str, Any]:
+def _row_line(state: CampaignState, row: Measurement) -> dict[str, Any]:
     points = [[None if np.isnan(x) else float(x) for x in p] for p in row.points]
-    role = state.stops[row.index].role
+    role = state.configurations[row.index].role
     return {"measured": row.number, "role": role, "configuration": row.q.tolist(), "points": points}
 
 
 def _exclusion_line(out: Exclusion) -> dict[str, Any]:
-    return {"excluded": out.q.tolist(), "radius": out.radius, "reason": out.reason[:500], "asked": out.asked}
+    return {"excluded": out.q.tolist(), "radius": out.radius, "reason": out.reason[:500], "asked": out.requested}
 
 
 def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:

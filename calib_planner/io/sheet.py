@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,31 @@ import yaml
 
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.io.csv import REPETITIONS
+from calib_planner.io.robots import URDF_SUFFIXES
 from calib_planner.io.text import write_text
+from calib_planner.io.urdf import read_speed_limits
 from calib_planner.io.yaml import write_document
-from calib_planner.planning import PlanSheet
+from calib_planner.planning import DWELL, Pace, PlanSheet, usual_pace
+from calib_planner.robot import Robot
 
+SHEET_FILES = ("plan_sheet.html", "plan_sheet.csv", "plan_sheet.yaml", "trajectory.yaml")
+"""The files of a sheet; ``report.write_sheet`` writes them."""
+SHARE = 0.25
+"""Share of a robot's speed limits at which its joints move between the visits."""
 WORDS = {True: "yes", False: "no", None: "not checked"}
+
+
+def robot_pace(robot: Robot, dwell: float = DWELL, share: float = SHARE) -> Pace:
+    """A share of the speed limits in the robot's URDF, or assumed speeds where there are none.
+
+    Args:
+        dwell: Time at standstill for each measurement [s].
+    """
+    usual, path = usual_pace(robot, dwell), Path(robot.source)
+    limits = read_speed_limits(path, robot.joint_names) if path.suffix.lower() in URDF_SUFFIXES else None
+    if limits is None:
+        return usual
+    return replace(usual, speeds=share * limits, origin=f"at most {share:.3g} of the URDF's speed limits")
 
 
 def write_sheet_yaml(path: str | Path, sheet: PlanSheet, field: str = "output") -> None:

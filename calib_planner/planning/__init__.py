@@ -23,7 +23,7 @@ from calib_planner.planning.information import (
     plan_space,
     smallest_size,
 )
-from calib_planner.planning.planner import Progress, plan
+from calib_planner.planning.planner import Callback, Progress, plan
 from calib_planner.planning.problem import (
     POSE_CRITERIA,
     Candidates,

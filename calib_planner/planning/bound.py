@@ -1,16 +1,26 @@
-"""How good could any plan be? An upper bound on its worth from the relaxed problem.
+"""How good could any plan be? An upper bound on its value Ψ from the best approximate design.
 
-Relax "n measurements, each at one configuration" to a probability measure ξ, with M(ξ) = M_0 + n Σ w_k I_1(q_k).
-By (B) of ``criteria``, for any M with slope G and sensitivity d(q) = tr(G I_1(q)),
+Let an *approximate design* be a probability measure ξ in place of "n measurements, each at one configuration",
+with M(ξ) = M_0 + n Σ w_k I_1(q_k). By (B) of ``criteria``, for any M with gradient G and sensitivity
+d(q) = tr(G I_1(q)),
 
-    Ψ(M*) ≤ tr(G M*) ≤ tr(G M_0) + n max_q d(q)          for every plan M* of n measurements,
+    Ψ(M*) ≤ tr(G M*) ≤ tr(G M_0) + n max_q d(q)          for every plan M* of n measurements,              (1)
 
 whatever its configurations and repetitions: n measurements with σ_c count at most as n at different places.
 That is the equivalence theorem; it is tight at the optimal measure. For eq. (14) it reads
 ρ0² ≥ φ²/d_max with φ = tr(A M⁻¹) and d = tr(A M⁻¹ I M⁻¹).
 
-The measure improves by alternating multiplicative updates w_k ← w_k √(d_k / mean) with adding maxima of d. The
-bound is as good as the maximisation of d: by search it is "numerical".
+The measure improves by multiplicative updates w_k ← w_k (d_k / mean)^e in turn with adding maxima of d. The bound
+is as good as the maximisation of d: by search it is "numerical".
+
+Among a finite number of candidates every d_j is computed, so that the bound is exact. If each of m candidates may
+be chosen only once, with r measurements at it, (B) gives
+
+    Ψ(M*) ≤ tr(G M_0) + r Σ (the m largest d_j),                                                           (2)
+
+at most the n·max d_j of (1); the measure that makes it tight has weights capped at 1/m. Most candidates get no
+weight: the updates run over those that have some, and after every round all candidates are looked at again. One
+round costs one product over the candidates.
 """
 
 from __future__ import annotations
@@ -30,13 +40,13 @@ from calib_planner.planning.search.descent import Descent, climb, descend
 SPREAD = 256
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
 """Weight of a spread of random configurations in every measure, first and last. The optimum is often singular:
-it keeps M invertible and d smooth, and costs the bound about its weight times the price of a random
+the spread makes M invertible and d smooth, and costs the bound about its weight times the price of a random
 plan."""
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxedProblem:
-    """What the measure is to be best for.
+class DesignProblem:
+    """What the approximate design is to be best for.
 
     Attributes:
         model: Information of one measurement (repetitions = 1).
@@ -44,8 +54,8 @@ class RelaxedProblem:
         prior: (p, p) M_0.
         measurements: n.
         feasibility: Where measuring is possible.
-        pool: (C, joints) the only configurations there are, or ``None`` for all within the limits.
-        distinct: Number of rows of the pool if each may be chosen once only.
+        candidates: (C, joints) the only configurations there are, or ``None`` for all within the limits.
+        distinct: m if every candidate may be chosen once only, else ``None``.
     """
 
     model: InformationModel
@@ -53,105 +63,106 @@ class RelaxedProblem:
     prior: FloatArray
     measurements: int
     feasibility: Feasibility
-    pool: FloatArray | None = None
+    candidates: FloatArray | None = None
     distinct: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxedDesign:
-    """The relaxed optimum, as far as found.
+class ApproximateDesign:
+    """The best approximate design known, and the bound that it gives.
 
     Attributes:
-        worth: Ψ of the best measure found.
-        bound: Smallest upper bound found on Ψ of any plan; numerical until proven.
-        support: (K, joints) configurations of the measure.
-        weights: (K,) their weights.
-        slope: (p, p) G that gave the bound.
+        value: Ψ of the design.
+        bound: Smallest upper bound known on Ψ of any plan; numerical until proven.
+        weights: (K,) weights of the configurations, summing to one.
+        gradient: (p, p) G that gave the bound.
+        support: (K, joints) its configurations [rad | m]; empty where the caller knows them.
     """
 
-    worth: float
+    value: float
     bound: float
-    support: FloatArray
     weights: FloatArray
-    slope: FloatArray
+    gradient: FloatArray
+    support: FloatArray
 
 
-def relaxed_design(
-    problem: RelaxedProblem,
+def approximate_design(
+    problem: DesignProblem,
     start: FloatArray,
     rng: np.random.Generator,
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
     *,
     rounds: int = 60,
     gap: float = 3e-3,
-) -> RelaxedDesign:
-    """Grow a discrete measure until the bound is within ``gap`` of its worth."""
-    if problem.pool is not None:
-        return _relaxed_pool(problem, problem.pool, stop)
+) -> ApproximateDesign:
+    """Grow a discrete measure until the bound is within ``gap`` of its value.
+
+    Args:
+        problem: What the design is for.
+        start: (K, joints) configurations to begin with, beside random ones [rad | m].
+        rng: Of the random configurations.
+        cancel: Called after every round; ``True`` ends the work with what there is.
+        rounds: Most rounds.
+        gap: Relative.
+    """
+    if problem.candidates is not None:
+        return _design_over_candidates(problem, problem.candidates, cancel)
     model, n = problem.model, problem.measurements
     everywhere = model.at(problem.feasibility.sample(rng, SPREAD)).mean(axis=0)
     support: FloatArray = np.concatenate([start, problem.feasibility.sample(rng, 16)])
     weights: FloatArray = np.full(len(support), 1.0 / len(support))
-    best: RelaxedDesign | None = None
+    best: ApproximateDesign | None = None
     for step in range(rounds):
         floor = max(FIRST_FLOOR * 0.7**step, LAST_FLOOR)
         ground = problem.prior + n * floor * everywhere
         unit = n * (1.0 - floor) * model.at(support)
-        weights, matrix = _multiplicative(problem.criterion, unit, weights, ground)
-        slope = problem.criterion.supporting_slope(matrix)
-        peaks = maximise_sensitivity(problem, slope, _probes(problem, slope, support, weights, rng))
-        worth = problem.criterion.exact(matrix)
-        ceiling = float(np.sum(slope * problem.prior)) + n * float(np.exp(-peaks.value.min()))
-        best = _better(best, RelaxedDesign(worth, max(ceiling, worth), support, weights, slope))
-        if best.worth >= (1.0 - gap) * best.bound or stop():
+        # Exponent ½ is monotone for traces; sharper criteria (worst case, smallest eigenvalue) overshoot with it.
+        weights, matrix = _reweighted(
+            problem.criterion, unit, weights, ground, iterations=100, exponent=0.5, growth=1.1
+        )
+        gradient = problem.criterion.supporting_gradient(matrix)
+        peaks = maximise_sensitivity(problem, gradient, _probes(problem, gradient, support, weights, rng))
+        value = problem.criterion.exact(matrix)
+        ceiling = float(np.sum(gradient * problem.prior)) + n * float(np.exp(-peaks.value.min()))
+        best = _better(best, ApproximateDesign(value, max(ceiling, value), weights, gradient, support))
+        if best.value >= (1.0 - gap) * best.bound or cancel():
             break
         new = peaks.x[np.argsort(peaks.value)[:6]]
-        keep = weights > 1e-6
+        strong = weights > 1e-6
         share = 0.02 if floor > LAST_FLOOR else 0.005
-        support = np.concatenate([support[keep], new])
-        weights = np.concatenate([weights[keep], np.full(len(new), share / len(new))])
+        support = np.concatenate([support[strong], new])
+        weights = np.concatenate([weights[strong], np.full(len(new), share / len(new))])
         weights /= weights.sum()
     assert best is not None
     return _checked(problem, best, rng) if problem.feasibility.constraints else best
 
 
-def _checked(problem: RelaxedProblem, best: RelaxedDesign, rng: np.random.Generator) -> RelaxedDesign:
-    """The bound once more from a thorough maximisation of d: along the edge of what is allowed, descents stop
-    short, and of many bounds the least would be the one that stopped first."""
+def _better(best: ApproximateDesign | None, new: ApproximateDesign) -> ApproximateDesign:
+    """The best measure and the best bound so far, which need not come from the same round."""
+    if best is None:
+        return new
+    top, low = (new if new.value > best.value else best), (new if new.bound < best.bound else best)
+    return replace(top, bound=max(low.bound, top.value), gradient=low.gradient)
+
+
+def _checked(problem: DesignProblem, best: ApproximateDesign, rng: np.random.Generator) -> ApproximateDesign:
+    """The bound once more from a thorough maximisation of d: along the edge of what is allowed, descents end too
+    early, and of many bounds the least would be the one that ended first."""
 
     def height(q: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("nab,ab->n", problem.model.at(q), best.slope))
+        return np.asarray(np.einsum("nab,ab->n", problem.model.at(q), best.gradient))
 
     drawn = problem.feasibility.sample(rng, 4096)
     starts = np.concatenate([best.support, drawn[np.argsort(-height(drawn))[:32]]])
-    inside = maximise_sensitivity(problem, best.slope, starts).x
+    inside = maximise_sensitivity(problem, best.gradient, starts).x
     top = climb(problem.feasibility, height, inside, rng)[1].max()
-    ceiling = float(np.sum(best.slope * problem.prior)) + problem.measurements * float(top)
+    ceiling = float(np.sum(best.gradient * problem.prior)) + problem.measurements * float(top)
     return replace(best, bound=max(ceiling, best.bound))
 
 
-def _relaxed_pool(problem: RelaxedProblem, pool: FloatArray, stop: Callable[[], bool]) -> RelaxedDesign:
-    """The same over a finite pool: every d is computed, so the bound is exact (see ``pool_bound``)."""
-    q = pool[problem.feasibility.mask(pool)]
-    if not len(q):
-        raise InfeasibleError("candidates", "no row of the pool satisfies the constraints")
-    rows = problem.model.whitened(q)
-    found = relax_pool(rows, problem.criterion, problem.prior, problem.measurements, problem.distinct, stop)
-    return RelaxedDesign(found.worth, found.bound, q, found.weights, found.slope)
-
-
-def _better(best: RelaxedDesign | None, new: RelaxedDesign) -> RelaxedDesign:
-    """The best measure and the best bound seen so far, which need not come from the same round."""
-    if best is None:
-        return new
-    top = new if new.worth > best.worth else best
-    low = new if new.bound < best.bound else best
-    return RelaxedDesign(top.worth, max(low.bound, top.worth), top.support, top.weights, low.slope)
-
-
 def _probes(
-    problem: RelaxedProblem,
-    slope: FloatArray,
+    problem: DesignProblem,
+    gradient: FloatArray,
     support: FloatArray,
     weights: FloatArray,
     rng: np.random.Generator,
@@ -159,31 +170,64 @@ def _probes(
     """Starts for the maximisation of d: the support, and the best of many random configurations."""
     known = support[np.argsort(-weights)[:10]]
     random = problem.feasibility.sample(rng, 512)
-    height = np.einsum("nab,ab->n", problem.model.at(random), slope)
+    height = np.einsum("nab,ab->n", problem.model.at(random), gradient)
     return np.concatenate([known, random[np.argsort(-height)[:14]]])
 
 
-def _multiplicative(
-    criterion: Criterion, unit: FloatArray, w: FloatArray, ground: FloatArray, iterations: int = 100
-) -> tuple[FloatArray, FloatArray]:
-    """Improve the weights of ``unit`` (K, p, p); returns them and M.
+def maximise_sensitivity(problem: DesignProblem, gradient: FloatArray, starts: FloatArray) -> Descent:
+    """Local maxima of d(q) over the feasible configurations, as minima of −log d, from ``starts`` (N, joints)."""
+    low, high = problem.model.robot.joint_limits.T
+    constrained = bool(problem.feasibility.constraints)
 
-    The exponent ½ is monotone for traces; sharper criteria (worst case, smallest eigenvalue) overshoot with it,
-    so it is halved whenever the worth falls.
+    def objective(q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        info = problem.model.linearised(q)
+        d = np.einsum("nip,nip->n", info.jacobian @ gradient, info.weighted)
+        d = np.maximum(d, 1e-300)
+        value = np.where(problem.feasibility.mask(q), -np.log(d), np.inf) if constrained else -np.log(d)
+        return value, info.gradient(-gradient / d[:, None, None])
+
+    return descend(objective, starts, low, high, iterations=40, tolerance=1e-4)
+
+
+def _normalised(w: FloatArray) -> FloatArray:
+    return np.asarray(w / w.sum())
+
+
+def _reweighted(
+    criterion: Criterion,
+    unit: FloatArray,
+    w: FloatArray,
+    ground: FloatArray,
+    *,
+    iterations: int,
+    exponent: float,
+    growth: float = 1.0,
+    normalised: Callable[[FloatArray], FloatArray] = _normalised,
+) -> tuple[FloatArray, FloatArray]:
+    """Improve the weights w (K,) of ``unit`` (K, p, p) by multiplicative updates; returns them and M (p, p).
+
+    Args:
+        criterion: What is maximised.
+        unit: (K, p, p) information of all measurements at one configuration of the support.
+        w: (K,) weights to begin with.
+        ground: (p, p) information that is there without them.
+        iterations: Most updates.
+        exponent: e of the first update; halved whenever the value falls.
+        growth: Factor by which e recovers after every success, up to its first value.
+        normalised: Makes the weights sum to one.
     """
     flat = unit.reshape(len(unit), -1)
     matrix = (w @ flat).reshape(ground.shape) + ground
-    worth, slope = (part[0] for part in criterion.worth_and_slope(matrix[None]))
-    exponent = 0.5
+    psi, gradient = (part[0] for part in criterion.value_and_gradient(matrix[None]))
+    first = exponent
     for _ in range(iterations):
-        d = np.maximum(flat @ slope.ravel(), 1e-300)
-        trial = w * (d / (w @ d)) ** exponent
-        trial = trial / trial.sum()
+        d = np.maximum(flat @ gradient.ravel(), 1e-300)
+        trial = normalised(w * (d / (w @ d)) ** exponent)
         moved = (trial @ flat).reshape(ground.shape) + ground
-        new_worth, new_slope = (part[0] for part in criterion.worth_and_slope(moved[None]))
-        if new_worth >= worth * (1.0 - 1e-12):
-            w, matrix, worth, slope = trial, moved, new_worth, new_slope
-            exponent = min(1.1 * exponent, 0.5)
+        new_psi, new_gradient = (part[0] for part in criterion.value_and_gradient(moved[None]))
+        if new_psi >= psi * (1.0 - 1e-12):
+            w, matrix, psi, gradient = trial, moved, new_psi, new_gradient
+            exponent = min(growth * exponent, first)
         elif exponent > 1e-3:
             exponent *= 0.5
         else:
@@ -191,82 +235,68 @@ def _multiplicative(
     return w, matrix
 
 
-def maximise_sensitivity(problem: RelaxedProblem, slope: FloatArray, starts: FloatArray) -> Descent:
-    """Local maxima of d(q) over the feasible configurations, as minima of −log d."""
-    low, high = problem.model.robot.joint_limits.T
-    constrained = bool(problem.feasibility.constraints)
-
-    def objective(q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        info = problem.model.linearised(q)
-        d = np.einsum("nip,nip->n", info.jacobian @ slope, info.weighted)
-        d = np.maximum(d, 1e-300)
-        value = np.where(problem.feasibility.mask(q), -np.log(d), np.inf) if constrained else -np.log(d)
-        return value, info.gradient(-slope / d[:, None, None])
-
-    return descend(objective, starts, low, high, iterations=40, tolerance=1e-4)
+# ── among candidates ─────────────────────────────────────────────────────────────────────────────────
 
 
-# ── The relaxed problem over a finite pool, where every sensitivity is computed: the bound is exact ─────────
-# With distinct rows (no candidate more than once, r measurements at each) (B) of ``criteria`` gives
-#
-#     Ψ(M*) ≤ tr(G M_0) + r Σ (the m largest tr(G I_1(q_j))),
-#
-# at most the m·r·max d_j of ``bound``; the measure that makes it tight has weights capped at 1/m. Most
-# candidates get no weight: the multiplicative updates run over those that have some, and after every round the
-# whole pool is looked at again. Cost per round: one product over the pool, linear in its size.
+def _design_over_candidates(
+    problem: DesignProblem, candidates: FloatArray, cancel: Callable[[], bool]
+) -> ApproximateDesign:
+    q = candidates[problem.feasibility.mask(candidates)]
+    if not len(q):
+        raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
+    rows, distinct = problem.model.whitened(q), problem.distinct
+    best = candidate_design(rows, problem.criterion, problem.prior, problem.measurements, distinct, cancel)
+    return replace(best, support=q)
 
 
-@dataclass(frozen=True, eq=False)
-class PoolMeasure:
-    """Relaxed optimum over a pool.
-
-    Attributes:
-        worth: Ψ of the measure.
-        bound: No plan has a larger Ψ.
-        weights: (C,) summing to one.
-        slope: (p, p) G that gave the bound.
-    """
-
-    worth: float
-    bound: float
-    weights: FloatArray
-    slope: FloatArray
-
-
-def relax_pool(
+def candidate_design(
     rows: FloatArray,
     criterion: Criterion,
     prior: FloatArray,
     measurements: int,
     distinct: int | None,
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
     *,
     gap: float = 2e-3,
     rounds: int = 40,
-) -> PoolMeasure:
-    """Improve a measure over the pool until its worth is within ``gap`` of the bound.
+) -> ApproximateDesign:
+    """Improve a measure over candidates until its value is within ``gap`` of the bound, eq. (2).
 
     Args:
         rows: (C, k, p) W^½ J of one measurement at each candidate.
+        criterion: A concave criterion.
+        prior: (p, p) M_0.
         measurements: Measurements in all.
         distinct: m when every candidate may be used once only, else ``None``.
+        cancel: Called after every round; ``True`` ends the work with what there is.
+        gap: Relative.
+        rounds: Most rounds.
     """
     flat = rows.reshape(-1, rows.shape[2])
     cap = 1.0 / distinct if distinct else 1.0
     weights: FloatArray = np.full(len(rows), 1.0 / len(rows))
-    best: PoolMeasure | None = None
+    nowhere = np.empty((0, 0))
+    best: ApproximateDesign | None = None
     for step in range(rounds):
         active = np.flatnonzero(weights > 1e-4 * weights.max()) if step else np.arange(len(rows))
-        part, matrix = _improve(criterion, measurements * _units(rows[active]), weights[active], prior, cap, step)
+        own = rows[active]
+        part, matrix = _reweighted(
+            criterion,
+            measurements * (np.swapaxes(own, 1, 2) @ own),
+            _capped(weights[active], cap),
+            prior,
+            iterations=30 if step else 12,
+            exponent=1.0,
+            normalised=lambda w: _capped(w, cap),
+        )
         weights = np.zeros(len(rows))
         weights[active] = part
-        slope = criterion.supporting_slope(matrix)
-        height = ((flat @ slope) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+        gradient = criterion.supporting_gradient(matrix)
+        height = ((flat @ gradient) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
         top = np.sort(np.partition(height, len(height) - distinct)[-distinct:]) if distinct else height.max()
-        ceiling = float(np.sum(slope * prior) + measurements * np.mean(top))
-        found = PoolMeasure(criterion.exact(matrix), ceiling, weights, slope)
-        best = found if best is None else _better_choice(best, found)
-        if best.worth >= (1.0 - gap) * best.bound or stop():
+        ceiling = float(np.sum(gradient * prior) + measurements * np.mean(top))
+        best = _better(best, ApproximateDesign(criterion.exact(matrix), ceiling, weights, gradient, nowhere))
+        if best.value >= (1.0 - gap) * best.bound or cancel():
             break
         promising = np.where(weights > 0, -np.inf, height)
         missing = np.argsort(-promising, kind="stable")[:8]
@@ -274,39 +304,7 @@ def relax_pool(
         share[missing[promising[missing] > np.min(top)]] = 1e-3 * cap
         weights = _capped(weights + share, cap)
     assert best is not None
-    return PoolMeasure(best.worth, max(best.bound, best.worth), best.weights, best.slope)
-
-
-def _better_choice(best: PoolMeasure, new: PoolMeasure) -> PoolMeasure:
-    top, low = (new if new.worth > best.worth else best), (new if new.bound < best.bound else best)
-    return PoolMeasure(top.worth, low.bound, top.weights, low.slope)
-
-
-def _units(rows: FloatArray) -> FloatArray:
-    return np.swapaxes(rows, 1, 2) @ rows
-
-
-def _improve(
-    criterion: Criterion, unit: FloatArray, w: FloatArray, prior: FloatArray, cap: float, step: int
-) -> tuple[FloatArray, FloatArray]:
-    """Multiplicative updates w ← w √d, capped; the exponent is halved whenever the worth falls."""
-    flat = unit.reshape(len(unit), -1)
-    w = _capped(w, cap)
-    matrix = (w @ flat).reshape(prior.shape) + prior
-    worth, slope = (part[0] for part in criterion.worth_and_slope(matrix[None]))
-    exponent = 1.0
-    for _ in range(30 if step else 12):
-        d = np.maximum(flat @ slope.ravel(), 1e-300)
-        trial = _capped(w * (d / (w @ d)) ** exponent, cap)
-        moved = (trial @ flat).reshape(prior.shape) + prior
-        new_worth, new_slope = (part[0] for part in criterion.worth_and_slope(moved[None]))
-        if new_worth >= worth * (1.0 - 1e-12):
-            w, matrix, worth, slope = trial, moved, new_worth, new_slope
-        elif exponent > 1e-3:
-            exponent *= 0.5
-        else:
-            break
-    return w, matrix
+    return replace(best, bound=max(best.bound, best.value))
 
 
 def _capped(w: FloatArray, cap: float) -> FloatArray:

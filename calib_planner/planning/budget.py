@@ -16,7 +16,7 @@ import numpy as np
 from calib_planner.arrays import check_count, check_number
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning.information import plan_space, smallest_size
-from calib_planner.planning.planner import plan, worth_of
+from calib_planner.planning.planner import plan, value_of
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import Plan
 
@@ -37,7 +37,7 @@ class Split:
     Attributes:
         plan: The plan recommended.
         tried: All plans computed, smallest number of configurations first.
-        fewest: No plan of fewer measurements can reach what was asked (0 where that is not known).
+        fewest: No plan of fewer measurements can reach the wanted accuracy (0 where that is not known).
     """
 
     plan: Plan
@@ -62,17 +62,18 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
     for k in _sizes(smallest):
         if k >= smallest + TRIED and best is not None:
             break
-        # The least multiple of k that is not below ``fewest`` may be no fewer than what was found already.
+        # The least multiple of k not below ``fewest`` may be no fewer than the best number of measurements.
         beaten = best is not None and fewest > 0 and k * -(-fewest // k) >= best.measurements
-        found = None if beaten else _smallest_repetition(problem, k, accuracy)
+        candidate = None if beaten else _smallest_repetition(problem, k, accuracy)
         watch(min(k - smallest + 1, TRIED), TRIED)
-        if found is None:
+        if candidate is None:
             continue
-        tried.append(found)
+        tried.append(candidate)
         if not fewest and problem.repeatability == 0 and problem.prior.empty:
-            fewest = int(np.ceil(found.measurements * (found.quality.value_bound / accuracy) ** 2 * (1 - 1e-9)))
-        if best is None or found.measurements < best.measurements:
-            best = found
+            needed = candidate.measurements * (candidate.quality.value_bound / accuracy) ** 2
+            fewest = int(np.ceil(needed * (1 - 1e-9)))
+        if best is None or candidate.measurements < best.measurements:
+            best = candidate
         if best.measurements <= max(fewest, k):
             break
     if best is None:
@@ -100,7 +101,7 @@ def _smallest_repetition(problem: PlanProblem, k: int, accuracy: float) -> Plan 
         return once
 
     def value(r: int) -> float:
-        return worth_of(replace(problem, configurations=k, repetitions=r), once.configurations)
+        return value_of(replace(problem, configurations=k, repetitions=r), once.configurations)
 
     low, high = 1, MOST_MEASUREMENTS // k
     if not value(high) <= accuracy:
@@ -109,8 +110,8 @@ def _smallest_repetition(problem: PlanProblem, k: int, accuracy: float) -> Plan 
         middle = (low + high) // 2
         low, high = (low, middle) if value(middle) <= accuracy else (middle, high)
     # Configurations chosen for that many repetitions may do with fewer, where σ_c or a prior matters.
-    found = plan(replace(problem, configurations=k, repetitions=high))
-    return found if found.quality.value <= accuracy else None
+    candidate = plan(replace(problem, configurations=k, repetitions=high))
+    return candidate if candidate.quality.value <= accuracy else None
 
 
 def split_budget(

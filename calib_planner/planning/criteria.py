@@ -1,8 +1,8 @@
-"""What a plan is worth: information functions of the information matrix M (Pukelsheim, Optimal Design of
+"""What plans are compared by: information functions of the information matrix M (Pukelsheim, Optimal Design of
 Experiments, 1993).
 
 Every criterion here is written as a function Ψ(M) to be *maximised* that is positive, concave and homogeneous,
-Ψ(cM) = c Ψ(M): twice the measurements, twice the worth. Then with a (super)gradient G = ∂Ψ/∂M
+Ψ(cM) = c Ψ(M): twice the measurements, twice the value. Then with a (super)gradient G = ∂Ψ/∂M
 
     Ψ(M*) ≤ trace(G M*)       for every M*,                                                            (B)
 
@@ -10,7 +10,7 @@ the supporting hyperplane at M passing through the origin; ``bound`` rests on no
 maximises log Ψ. Three criteria of the calibration literature (O2, O4 and plain conditioning) are not concave;
 they can be searched for but have no bound.
 
-    name        worth Ψ(M)                                value reported
+    name        value Ψ(M)                                value reported
     test_pose   1 / Σ_k w_k tr(J_k M⁻¹ J_kᵀ)              ρ0 = Ψ^(−1/2) [m], eq. (14)
     worst_pose  1 / max_k tr(J_k M⁻¹ J_kᵀ)                largest ρ0 [m]
     d, o1       det(M)^(1/p)                              det(M)^(1/p); O1 = det(M)^(1/2p)/√m
@@ -47,11 +47,11 @@ class Criterion(Protocol):
         """Whether (B) holds, so that there is a bound."""
         ...
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``matrices`` (S, p, p) → Ψ (S,), to be maximised, and ∂Ψ/∂M (S, p, p)."""
         ...
 
-    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+    def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         """G (p, p) of (B) at ``matrix`` for the *exact* criterion, where the search uses a smooth one."""
         ...
 
@@ -60,8 +60,8 @@ class Criterion(Protocol):
         ...
 
 
-def _symmetric(slope: FloatArray) -> FloatArray:
-    return 0.5 * (slope + np.swapaxes(slope, -1, -2))
+def _symmetric(gradient: FloatArray) -> FloatArray:
+    return 0.5 * (gradient + np.swapaxes(gradient, -1, -2))
 
 
 class _Smooth:
@@ -69,14 +69,14 @@ class _Smooth:
 
     concave = True
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         raise NotImplementedError
 
-    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
-        return self.worth_and_slope(matrix[None])[1][0]
+    def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
+        return self.value_and_gradient(matrix[None])[1][0]
 
     def exact(self, matrix: FloatArray) -> float:
-        return float(self.worth_and_slope(matrix[None])[0][0])
+        return float(self.value_and_gradient(matrix[None])[0][0])
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,11 @@ class Accuracy(_Smooth):
 
     weight: FloatArray
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(matrices)
         half = inverse @ self.weight
-        worth = 1.0 / np.einsum("sii->s", half)
-        return np.asarray(worth, np.float64), _symmetric((worth**2)[:, None, None] * (half @ inverse))
+        psi = 1.0 / np.einsum("sii->s", half)
+        return np.asarray(psi, np.float64), _symmetric((psi**2)[:, None, None] * (half @ inverse))
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class WorstAccuracy:
     """1 / max_k trace(A_k M⁻¹): the worst of several test poses.
 
     The search uses the power mean Σ_k (…)^s with s = ``sharpness`` for the maximum. For (B) any mixture
-    Σ λ_k A_k gives a valid slope, since the largest is at least the mixture; the power mean supplies λ.
+    Σ λ_k A_k gives a valid gradient, since the largest is at least the mixture; the power mean supplies λ.
 
     Attributes:
         weights: (K, p, p) the matrices A_k.
@@ -115,21 +115,21 @@ class WorstAccuracy:
         inverse = np.linalg.inv(matrices)
         return np.asarray(inverse, np.float64), np.einsum("sab,kba->sk", inverse, self.weights)
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse, values = self._values(matrices)
         top = values.max(axis=1, keepdims=True)
         powers = (values / top) ** self.sharpness
         total = powers.mean(axis=1)
-        worth = 1.0 / (top[:, 0] * total ** (1.0 / self.sharpness))
+        psi = 1.0 / (top[:, 0] * total ** (1.0 / self.sharpness))
         share = powers / values / (total * len(self.weights))[:, None]
         mixed = np.einsum("sk,kab->sab", share, self.weights)
-        return worth, _symmetric(worth[:, None, None] * (inverse @ mixed @ inverse))
+        return psi, _symmetric(psi[:, None, None] * (inverse @ mixed @ inverse))
 
-    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+    def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         _, values = self._values(matrix[None])
         powers = (values[0] / values[0].max()) ** self.sharpness / values[0]
         mixed = np.einsum("k,kab->ab", powers / powers.sum(), self.weights)
-        return Accuracy(mixed).supporting_slope(matrix)
+        return Accuracy(mixed).supporting_gradient(matrix)
 
     def exact(self, matrix: FloatArray) -> float:
         return float(1.0 / self._values(matrix[None])[1].max())
@@ -139,24 +139,24 @@ class WorstAccuracy:
 class Determinant(_Smooth):
     """det(M)^(1/p): the D-criterion, invariant under the units of the parameters up to a constant."""
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         size = matrices.shape[-1]
         sign, log = np.linalg.slogdet(matrices)
-        worth = np.where(sign > 0, np.exp(log / size), 0.0)
-        return worth, _symmetric(worth[:, None, None] / size * np.linalg.inv(matrices))
+        psi = np.where(sign > 0, np.exp(log / size), 0.0)
+        return psi, _symmetric(psi[:, None, None] / size * np.linalg.inv(matrices))
 
 
 @dataclass(frozen=True)
 class DiagonalDeterminant(_Smooth):
     """(Π (M⁻¹)_ii)^(−1/p): D*, small variances *and* independence, since Π (M⁻¹)_ii ≥ det M⁻¹."""
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         size = matrices.shape[-1]
         inverse = np.linalg.inv(matrices)
         diagonal = np.einsum("sii->si", inverse)
-        worth = np.exp(-np.log(np.maximum(diagonal, 1e-300)).mean(axis=1))
+        psi = np.exp(-np.log(np.maximum(diagonal, 1e-300)).mean(axis=1))
         middle = inverse / diagonal[:, None, :]
-        return worth, _symmetric(worth[:, None, None] / size * (middle @ inverse))
+        return psi, _symmetric(psi[:, None, None] / size * (middle @ inverse))
 
 
 @dataclass(frozen=True)
@@ -167,19 +167,19 @@ class PowerMean:
     smallest: bool = False
     concave: bool = True
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         s = self.power
         values, vectors = np.linalg.eigh(matrices)
         values = np.maximum(values, 1e-300)
         lowest = values[:, :1]
         scaled = (lowest / values) ** s
-        worth = lowest[:, 0] * scaled.mean(axis=1) ** (-1.0 / s)
-        weights = worth[:, None] * scaled / values / scaled.sum(axis=1, keepdims=True)
-        return worth, np.einsum("sik,sk,sjk->sij", vectors, weights, vectors)
+        psi = lowest[:, 0] * scaled.mean(axis=1) ** (-1.0 / s)
+        weights = psi[:, None] * scaled / values / scaled.sum(axis=1, keepdims=True)
+        return psi, np.einsum("sik,sk,sjk->sij", vectors, weights, vectors)
 
-    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+    def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         if not self.smallest:
-            return self.worth_and_slope(matrix[None])[1][0]
+            return self.value_and_gradient(matrix[None])[1][0]
         values, vectors = np.linalg.eigh(matrix)
         weights = (values[0] / np.maximum(values, 1e-300)) ** (self.power + 1.0)
         return (vectors * (weights / weights.sum())) @ vectors.T
@@ -187,7 +187,7 @@ class PowerMean:
     def exact(self, matrix: FloatArray) -> float:
         if self.smallest:
             return float(max(np.linalg.eigvalsh(matrix)[0], 0.0))
-        return float(self.worth_and_slope(matrix[None])[0][0])
+        return float(self.value_and_gradient(matrix[None])[0][0])
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class EigenvalueRatio:
     power: float = 8.0
     concave: bool = False
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         values, vectors = np.linalg.eigh(matrices)
         values = np.maximum(values, 1e-300)
         s, a = self.power, self.numerator
@@ -206,12 +206,12 @@ class EigenvalueRatio:
         high = (values / values[:, -1:]) ** s
         smallest = values[:, 0] * low.sum(axis=1) ** (-1.0 / s)
         largest = values[:, -1] * high.sum(axis=1) ** (1.0 / s)
-        worth = smallest**a / largest
+        psi = smallest**a / largest
         d_log = a * low / low.sum(axis=1, keepdims=True) - high / high.sum(axis=1, keepdims=True)
-        weights = worth[:, None] * d_log / values
-        return worth, np.einsum("sik,sk,sjk->sij", vectors, weights, vectors)
+        weights = psi[:, None] * d_log / values
+        return psi, np.einsum("sik,sk,sjk->sij", vectors, weights, vectors)
 
-    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+    def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         raise NotImplementedError("this criterion is not concave: it has no bound")
 
     def exact(self, matrix: FloatArray) -> float:
@@ -226,22 +226,22 @@ class Compound(_Smooth):
     Attributes:
         criteria: The parts, all concave.
         shares: (n,) weights, summing to one.
-        references: (n,) the best known worth r_i of each, per measurement.
+        references: (n,) the best known value r_i of each, per measurement.
     """
 
     criteria: tuple[Criterion, ...]
     shares: tuple[float, ...]
     references: tuple[float, ...]
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = [c.worth_and_slope(matrices) for c in self.criteria]
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        parts = [c.value_and_gradient(matrices) for c in self.criteria]
         log = sum(
             w * np.log(np.maximum(psi / r, 1e-300))
             for w, r, (psi, _) in zip(self.shares, self.references, parts, strict=True)
         )
-        worth = np.exp(log)
-        slope = sum((w * worth / psi)[:, None, None] * g for w, (psi, g) in zip(self.shares, parts, strict=True))
-        return worth, np.asarray(slope)
+        psi = np.exp(log)
+        gradient = sum((w * psi / psi)[:, None, None] * g for w, (psi, g) in zip(self.shares, parts, strict=True))
+        return psi, np.asarray(gradient)
 
 
 @dataclass(frozen=True)
@@ -278,14 +278,14 @@ class Eliminating:
         schur = matrices[:, i][:, :, i] - np.swapaxes(cross, 1, 2) @ solved
         return _symmetric(schur), lift
 
-    def worth_and_slope(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         schur, lift = self._reduce(matrices)
-        worth, slope = self.inner.worth_and_slope(schur)
-        return worth, lift @ slope @ np.swapaxes(lift, 1, 2)
+        psi, gradient = self.inner.value_and_gradient(schur)
+        return psi, lift @ gradient @ np.swapaxes(lift, 1, 2)
 
-    def supporting_slope(self, matrix: FloatArray) -> FloatArray:
+    def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         schur, lift = self._reduce(matrix[None])
-        return lift[0] @ self.inner.supporting_slope(schur[0]) @ lift[0].T
+        return lift[0] @ self.inner.supporting_gradient(schur[0]) @ lift[0].T
 
     def exact(self, matrix: FloatArray) -> float:
         return self.inner.exact(self._reduce(matrix[None])[0][0])
@@ -327,7 +327,7 @@ def make_criterion(
 
 @dataclass(frozen=True)
 class Report:
-    """How a criterion's worth is told to people.
+    """How a criterion's value is told to people.
 
     Attributes:
         unit: Unit of the value; empty where it depends on the parameters' units.
@@ -353,24 +353,24 @@ REPORTS = {
 }
 
 
-def reported_value(name: str, worth: float, size: int, measurements: int) -> float:
-    """The value of the table at the top for a worth Ψ."""
-    if worth <= 0:
+def reported_value(name: str, psi: float, size: int, measurements: int) -> float:
+    """The value of the table at the top for a value Ψ."""
+    if psi <= 0:
         return float("inf") if REPORTS[name].sense == "min" else 0.0
     if name in ("test_pose", "worst_pose"):
-        return float(worth**-0.5)
+        return float(psi**-0.5)
     if name == "a":
-        return size / worth
+        return size / psi
     if name == "o1":
-        return float(np.sqrt(worth / measurements))
+        return float(np.sqrt(psi / measurements))
     if name in ("o2", "o3", "o4"):
-        return float(np.sqrt(worth))
+        return float(np.sqrt(psi))
     if name == "o5":
-        return float(np.sqrt(worth)) / size
-    return worth
+        return float(np.sqrt(psi)) / size
+    return psi
 
 
-def efficiency(name: str, worth: float, bound: float) -> float:
+def efficiency(name: str, psi: float, bound: float) -> float:
     """Value over bound in the criterion's own convention, at most 1: √(Ψ/Ψ*) for accuracies, Ψ/Ψ* else."""
-    ratio = worth / bound if bound > 0 else 0.0
+    ratio = psi / bound if bound > 0 else 0.0
     return float(np.sqrt(max(ratio, 0.0))) if name in ("test_pose", "worst_pose") else float(ratio)

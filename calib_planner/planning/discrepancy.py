@@ -8,7 +8,7 @@ With c_l(q) = ∂p/∂q_l, independent f_l of unit variance and correlation ρ, 
     e(q) = Σ_l σ_l c_l(q) f_l(q_l) + white,     ρ(q_l, q'_l) = exp(−(2 sin((q_l − q'_l)/2))² / 2ℓ²),          (1)
     Σ(q) = Σ_l σ_l² c_l c_lᵀ + s² I + instrument.                                                         (2)
 
-Two things follow for a plan: a configuration is worth less the longer the joints' levers are — just the stretched
+Two things follow for a plan: a configuration tells less the longer the joints' levers are — just the stretched
 ones that plain optimal plans run to — and two configurations that share a joint angle share its error.
 
 The estimator is the ordinary one, regularised: Gaussian priors P on the parameters and weights W = Σ(q)⁻¹ per

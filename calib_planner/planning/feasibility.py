@@ -93,52 +93,52 @@ class Feasibility:
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
         """(count, joints) random feasible configurations.
 
-        Uniform within the limits, those that break a constraint rejected. Where nearly all are, the few found
-        are multiplied by random steps from them.
+        Uniform within the limits, those that break a constraint rejected. Where nearly all are, the few
+        feasible ones are multiplied by random steps from them.
 
         Raises:
-            InfeasibleError: None was found; names the constraint, or the combination, that empties the set.
+            InfeasibleError: There is none; names the constraint, or the combination, that empties the set.
         """
         low, high = self.limits.T
         if not self.constraints:
             return rng.uniform(low, high, (count, len(low)))
-        found: list[FloatArray] = []
+        known: list[FloatArray] = []
         have, tried, batch = 0, 0, max(4 * count, 1024)
         while have < count and (tried < PATIENCE or have > RARE * tried):
             q = rng.uniform(low, high, (min(batch, 20_000), len(low)))
             good = q[self.mask(q)]
-            found.append(good)
+            known.append(good)
             have, tried = have + len(good), tried + len(q)
         if not have:
             raise self._empty(
                 rng.uniform(low, high, (WITNESSES, len(low))), "random configurations within the joint limits"
             )
-        return self._multiplied(rng, np.concatenate(found), count)[:count]
+        return self._multiplied(rng, np.concatenate(known), count)[:count]
 
-    def check_pool(self, pool: FloatArray, count: int) -> None:
-        """Refuse a pool (C, joints) of which fewer than ``count`` configurations are feasible.
+    def check_candidates(self, candidates: FloatArray, count: int) -> None:
+        """Refuse candidates (C, joints) of which fewer than ``count`` configurations are feasible.
 
         Raises:
-            InfeasibleError: Names the constraint, or the combination, that empties the pool.
+            InfeasibleError: Names the constraint, or the combination, that leaves none of them.
         """
-        allowed = int(self.mask(pool).sum())
+        allowed = int(self.mask(candidates).sum())
         if not allowed:
-            raise self._empty(pool, "candidates")
+            raise self._empty(candidates, "candidates")
         if allowed < count:
-            text = f"{allowed} of {len(pool)} satisfy the constraints, {count} are wanted"
-            raise InfeasibleError("candidates", f"{text} ({self._table(pool)[1]})")
+            text = f"{allowed} of {len(candidates)} satisfy the constraints, {count} are wanted"
+            raise InfeasibleError("candidates", f"{text} ({self._table(candidates)[1]})")
 
-    def _multiplied(self, rng: np.random.Generator, found: FloatArray, count: int) -> FloatArray:
-        """At least ``count`` rows: ``found`` and feasible neighbours of it, from steps as long as they may be."""
+    def _multiplied(self, rng: np.random.Generator, known: FloatArray, count: int) -> FloatArray:
+        """At least ``count`` rows: ``known`` and feasible neighbours of it, from steps as long as they may be."""
         low, high = self.limits.T
         step = 0.1
-        while len(found) < count:
-            origin = found[rng.integers(len(found), size=4096)]
+        while len(known) < count:
+            origin = known[rng.integers(len(known), size=4096)]
             q = np.clip(origin + step * (high - low) * rng.normal(size=origin.shape), low, high)
             good = q[self.mask(q)]
-            found = np.concatenate([found, good])
+            known = np.concatenate([known, good])
             step = min(2 * step, 0.1) if len(good) > 400 else step / 2
-        return found
+        return known
 
     def _table(self, q: FloatArray) -> tuple[list[NDArray[np.bool_]], str]:
         """What each constraint allows of ``q`` (N, joints), as masks (N,) and as text."""
@@ -164,5 +164,5 @@ class Feasibility:
             return InfeasibleError(
                 names, f"none of {len(q)} {what} within the joint limits satisfies it ({table})"
             )
-        text = f"each allows some of {len(q)} {what}, all together none ({table}); relax one"
+        text = f"each allows some of {len(q)} {what}, all together none ({table}); loosen one"
         return InfeasibleError(names, text)

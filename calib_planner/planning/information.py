@@ -9,11 +9,14 @@ configuration itself that repetition does not average away (robot repeatability,
 M_0 being what is known beforehand (prior standard deviations, earlier measurements). For Σ = σ² I, σ_c = 0 and
 M_0 = 0 this is eq. (11). All matrices are in physical units, 1/(parameter unit)².
 
-Gradient. For ψ(M) with slope G, dψ = Σ_i tr(G dI(q_i)) and
+Gradient. For ψ(M) with gradient G, dψ = Σ_i tr(G dI(q_i)) and
 
     tr(G dI) = 2 tr(G Jᵀ W dJ) − tr(K dΣ)/r,     K = W J G Jᵀ W  per target:
 
 the first term goes back to the joints by ``Linearisation.pull_back``, the second by ∂Σ/∂p and ∂p/∂q.
+
+``plan_space`` makes a plan problem ready for numbers: parameters that no configuration can tell apart are taken
+out first (see ``robot.analyse``), so that every matrix is invertible for some plan.
 """
 
 from __future__ import annotations
@@ -113,12 +116,12 @@ class LinearisedInformation:
         left = self.jacobian.reshape(-1, rows, p)
         return np.swapaxes(left, 1, 2) @ self.weighted.reshape(-1, rows, p)
 
-    def gradient(self, slopes: FloatArray) -> FloatArray:
-        """∂ψ/∂q (N, joints) for slopes G: (N/size, p, p), each serving a run of ``size`` configurations."""
+    def gradient(self, gradients: FloatArray) -> FloatArray:
+        """∂ψ/∂q (N, joints) for gradients G: (N/size, p, p), each serving a run of ``size`` configurations."""
         n, rows, p = self.jacobian.shape
         targets = rows // 3
-        size = n // len(slopes)
-        pull = (self.weighted.reshape(len(slopes), size * rows, p) @ slopes).reshape(n, rows, p)
+        size = n // len(gradients)
+        pull = (self.weighted.reshape(len(gradients), size * rows, p) @ gradients).reshape(n, rows, p)
         weights = 2.0 * pull.transpose(2, 1, 0)
         gradient = self.lin.pull_back(weights.reshape(p, targets, 3, n))
         noise = self.model.noise
@@ -126,8 +129,8 @@ class LinearisedInformation:
             return gradient
         points = self.lin.points.transpose(2, 0, 1)
         blocks = pull.reshape(n, targets, 3, p) @ np.swapaxes(self.weighted.reshape(n, targets, 3, p), -1, -2)
-        slope = covariance_gradient(noise, points) / self.model.repetitions
-        force = -np.einsum("ntij,ntijx->ntx", blocks, slope)
+        by_point = covariance_gradient(noise, points) / self.model.repetitions
+        force = -np.einsum("ntij,ntijx->ntx", blocks, by_point)
         return gradient + np.einsum("ntx,jtxn->nj", force, self.lin.joint_columns)
 
 
@@ -162,9 +165,7 @@ def error_variance(test_jacobian: FloatArray, matrix: FloatArray) -> float:
     return float(np.einsum("ij,jk,ik->", test_jacobian, inverse, test_jacobian)) / targets
 
 
-# ── A plan problem made ready for numbers: identifiable parameters, prior information, the criterion ────────
-# Parameters that no configuration can tell apart are taken out first (see ``identifiability``), so that every
-# matrix below is invertible for some plan. What is known beforehand enters as M_0.
+# ── the plan problem in numbers ──────────────────────────────────────────────────────────────────────────
 
 SAMPLE = 512
 """Random configurations that stand for the whole workspace."""
@@ -175,11 +176,11 @@ class PlanSpace:
     """The problem in parameters that some plan can tell apart; p of them, q of interest.
 
     Attributes:
-        problem: What was asked.
+        problem: The request.
         robot: Active in the identifiable parameters only.
         identifiability: Which of the problem's parameters those are.
         interest: Indices (among p) of the parameters that are not nuisance.
-        model: Information of one configuration, repeated as asked.
+        model: Information of one configuration, repeated as wanted.
         single: Information of one measurement.
         prior: (p, p) M_0.
         feasibility: The constraints.
@@ -210,7 +211,7 @@ class PlanSpace:
         return Eliminating(made, self.interest, tuple(i for i in range(p) if i not in self.interest))
 
     def search_criterion(self) -> Criterion:
-        """What the search maximises: the criterion asked for, kept from going blind elsewhere."""
+        """What the search maximises: the criterion wanted, with a share for accuracy elsewhere."""
         share = self.problem.search.general_weight
         plain = self.criterion(self.problem.criterion)
         inner = plain.inner if isinstance(plain, Eliminating) else plain
@@ -236,36 +237,36 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     jacobians = np.ascontiguousarray(problem.robot.jacobian(q))
     prior_rows = _prior_rows(problem)
     stacked = np.concatenate([jacobians.reshape(-1, len(names)), prior_rows * problem.instrument.typical])
-    found = analyse(stacked, names)
-    kept = sorted(found.kept)
-    if not kept:
+    identifiable = analyse(stacked, names)
+    free = sorted(identifiable.free)
+    if not free:
         raise InfeasibleError(
             "parameters",
             f"no measurement of these targets depends on {', '.join(names)}; choose other parameters, or "
             "give the tool a target off the last axis",
         )
     prior = prior_rows.T @ prior_rows
-    _check_enough(problem, jacobians[:, :, kept], prior[np.ix_(kept, kept)])
-    robot = replace(problem.robot, joint_limits=feasibility.limits).with_parameters([names[i] for i in kept])
+    _check_enough(problem, jacobians[:, :, free], prior[np.ix_(free, free)])
+    robot = replace(problem.robot, joint_limits=feasibility.limits).with_parameters([names[i] for i in free])
     interest = tuple(i for i, n in enumerate(robot.parameter_names) if not is_nuisance(n)) or tuple(
-        range(len(kept))
+        range(len(free))
     )
-    mask = np.isin(np.arange(len(kept)), interest)
-    tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(kept)))
+    mask = np.isin(np.arange(len(free)), interest)
+    tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(free)))
     if len(problem.test_pose_array):
         tests = robot.jacobian(problem.test_pose_array) * mask
     single = InformationModel(robot, problem.instrument, problem.repeatability)
     return PlanSpace(
         problem=problem,
         robot=robot,
-        identifiability=found,
+        identifiability=identifiable,
         interest=interest,
         model=InformationModel(robot, problem.instrument, problem.repeatability, problem.repetitions),
         single=single,
-        prior=prior[np.ix_(kept, kept)],
+        prior=prior[np.ix_(free, free)],
         feasibility=feasibility,
         test_jacobians=tests,
-        general=accuracy_weights(jacobians[:, :, kept] * mask).mean(axis=0),
+        general=accuracy_weights(jacobians[:, :, free] * mask).mean(axis=0),
         sample=single.at(q).mean(axis=0),
     )
 
@@ -273,11 +274,11 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
 def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArray:
     """Configurations that stand for all a plan may use; the same for every seed."""
     rng = np.random.default_rng(0)
-    if problem.candidates is None:
+    q = problem.candidate_array
+    if q is None:
         return feasibility.sample(rng, SAMPLE)
-    pool = np.asarray(problem.candidate_array)
-    feasibility.check_pool(pool, problem.configurations if problem.once_each else 1)
-    return pool if len(pool) <= SAMPLE else pool[rng.choice(len(pool), SAMPLE, replace=False)]
+    feasibility.check_candidates(q, problem.configurations if problem.once_each else 1)
+    return q if len(q) <= SAMPLE else q[rng.choice(len(q), SAMPLE, replace=False)]
 
 
 def _prior_rows(problem: PlanProblem) -> FloatArray:

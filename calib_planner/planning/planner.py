@@ -1,8 +1,8 @@
-"""The verb: ``plan(problem)`` → ``Plan``. Prepare, relax, search, prove what was reached.
+"""The verb: ``plan(problem)`` → ``Plan``. Prepare, bound, search, prove what was reached.
 
-The relaxed problem comes first: its optimum is the bound, and its support is where good plans are. Then the
+The approximate design comes first: it gives the bound, and its support is where good plans are. Then the
 search, in independent parts that any ``concurrent.futures`` executor may do. Compound criteria are
-geometric means of efficiencies, so their parts' relaxed optima are found before them.
+geometric means of efficiencies, so their parts' approximate designs are computed before them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray, one_thread
-from calib_planner.planning.bound import RelaxedDesign, RelaxedProblem, relaxed_design
+from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.prove import Proof, prove_bound
 from calib_planner.planning.criteria import (
     Compound,
@@ -26,19 +26,17 @@ from calib_planner.planning.criteria import (
 from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
 from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
 from calib_planner.planning.result import STATUS, Plan, PlanQuality
-from calib_planner.planning.search.exchange import PoolProblem, choose
+from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.planning.search.prediction import choose_for_prediction, prediction_problem
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
 
 GOOD_ENOUGH = 0.012
-"""Distance of a plan's worth from its bound, as a share, at which the search ends; half as much in ρ0."""
+"""Distance of a plan's value from its bound, as a share, at which the search ends; half as much in ρ0."""
 
 AGREEMENT = 2e-4
-"""Difference of log worths below which two parts of the search have found the same plan."""
-
-__all__ = ["Progress", "plan", "worth_of"]
+"""Difference of log values below which two parts of the search have reached the same plan."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Progress:
     """What a callback is told while the planner works.
 
     Attributes:
-        starts_done, starts_total: Descents finished and asked for.
+        starts_done, starts_total: Descents finished and wanted.
         best_accuracy: Best value of the criterion so far (ρ0 [m] for test poses); NaN before the first.
         lower_bound: Bound on that value; NaN before it is known.
         seconds: Time spent.
@@ -60,6 +58,7 @@ class Progress:
 
 
 Callback = Callable[[Progress], bool | None]
+"""Told of progress; what returns ``True`` cancels the search."""
 
 
 @one_thread
@@ -73,7 +72,7 @@ def plan(
     """Find the best configurations, and a bound on how good any could be.
 
     Args:
-        problem: What is asked.
+        problem: The request.
         callback: Told of progress; returning ``True`` cancels, the best plan so far being returned.
         executor: Any ``concurrent.futures`` executor; the plan is the same whichever, or without one. With
             one, time limit and cancellation act between the parts of the work.
@@ -87,24 +86,24 @@ def plan(
     *seeds, own = np.random.SeedSequence(problem.search.seed).spawn(len(parts(problem.search.starts)) + 1)
     criterion, target = _criteria(space, np.random.default_rng(own))
     rng = np.random.default_rng(own)
-    relaxed = _relax(space, target, rng, clock.stop) if target.concave else None
+    design = _approximate(space, target, rng, clock.over) if target.concave else None
     proof = None
-    if prove and relaxed is not None:
+    if prove and design is not None:
         proof_rng = np.random.default_rng(own.spawn(1)[0])
-        relaxed, proof = prove_bound(_relaxed_problem(space, target), relaxed, proof_rng, stop=clock.stop)
-    clock.tell(bound=relaxed.bound if relaxed else None)
+        design, proof = prove_bound(_design_problem(space, target), design, proof_rng, cancel=clock.over)
+    clock.tell(bound=design.bound if design else None)
     if problem.candidates is not None:
-        found = _choose(space, criterion, relaxed, rng, clock)
+        result = _choose(space, criterion, design, rng, clock)
     else:
-        found = _search(space, criterion, relaxed, seeds, clock, executor)
-    return _assemble(space, target, relaxed, proof, found, clock)
+        result = _search(space, criterion, design, seeds, clock, executor)
+    return _assemble(space, target, design, proof, result, clock)
 
 
-def worth_of(problem: PlanProblem, configurations: FloatArray) -> float:
+def value_of(problem: PlanProblem, configurations: FloatArray) -> float:
     """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
     space = plan_space(problem)
-    worth = _worth(space, space.criterion(problem.criterion), configurations)
-    return reported_value(problem.criterion, worth, len(space.interest), problem.measurements)
+    psi = _psi_of(space, space.criterion(problem.criterion), configurations)
+    return reported_value(problem.criterion, psi, len(space.interest), problem.measurements)
 
 
 # ── the parts ────────────────────────────────────────────────────────────────────────────────────────
@@ -121,25 +120,25 @@ class _Clock:
         self.cancelled = self.late = False
         self.last = Progress(0, problem.search.starts, float("nan"), float("nan"), 0.0)
 
-    def stop(self) -> bool:
+    def over(self) -> bool:
         self.late = self.late or time.perf_counter() > self.deadline
         self.tell()
         return self.late or self.cancelled
 
-    def tell(self, done: int | None = None, log_worth: float | None = None, bound: float | None = None) -> None:
+    def tell(self, done: int | None = None, log_value: float | None = None, bound: float | None = None) -> None:
         changes: dict[str, float] = {"seconds": self.seconds}
         if done is not None:
             changes["starts_done"] = done
-        if log_worth is not None:
-            changes["best_accuracy"] = self._value(float(np.exp(log_worth)))
+        if log_value is not None:
+            changes["best_accuracy"] = self._value(float(np.exp(log_value)))
         if bound is not None:
             changes["lower_bound"] = self._value(bound)
         self.last = replace(self.last, **changes)  # type: ignore[arg-type]
         if self.callback is not None and self.callback(self.last):
             self.cancelled = True
 
-    def _value(self, worth: float) -> float:
-        return reported_value(self.problem.criterion, worth, self.size, self.problem.measurements)
+    def _value(self, psi: float) -> float:
+        return reported_value(self.problem.criterion, psi, self.size, self.problem.measurements)
 
     @property
     def seconds(self) -> float:
@@ -153,22 +152,22 @@ def _criteria(space: PlanSpace, rng: np.random.Generator) -> tuple[Criterion, Cr
         return space.search_criterion(), space.criterion(problem.criterion)
     shares = {problem.criterion: 1.0 - sum(problem.compound.values()), **problem.compound}
     parts = tuple(space.criterion(name) for name in shares)
-    references = tuple(_relax(space, part, rng, lambda: False).worth for part in parts)
+    references = tuple(_approximate(space, part, rng, lambda: False).value for part in parts)
     made = Compound(parts, tuple(shares.values()), references)
     return made, made
 
 
-def _relax(
-    space: PlanSpace, criterion: Criterion, rng: np.random.Generator, stop: Callable[[], bool]
-) -> RelaxedDesign:
+def _approximate(
+    space: PlanSpace, criterion: Criterion, rng: np.random.Generator, cancel: Callable[[], bool]
+) -> ApproximateDesign:
     tests = space.problem.test_pose_array
     usable = tests[space.feasibility.mask(tests)] if space.problem.candidates is None else tests[:0]
-    return relaxed_design(_relaxed_problem(space, criterion), usable, rng, stop)
+    return approximate_design(_design_problem(space, criterion), usable, rng, cancel)
 
 
-def _relaxed_problem(space: PlanSpace, criterion: Criterion) -> RelaxedProblem:
+def _design_problem(space: PlanSpace, criterion: Criterion) -> DesignProblem:
     problem = space.problem
-    return RelaxedProblem(
+    return DesignProblem(
         space.single,
         criterion,
         space.prior,
@@ -182,7 +181,7 @@ def _relaxed_problem(space: PlanSpace, criterion: Criterion) -> RelaxedProblem:
 def _search(
     space: PlanSpace,
     criterion: Criterion,
-    relaxed: RelaxedDesign | None,
+    design: ApproximateDesign | None,
     seeds: list[np.random.SeedSequence],
     clock: _Clock,
     executor: Executor | None,
@@ -195,8 +194,8 @@ def _search(
         prior=space.prior,
         size=space.problem.configurations,
         feasibility=space.feasibility,
-        support=relaxed.support if relaxed else nobody,
-        weights=relaxed.weights if relaxed else np.empty(0),
+        support=design.support if design else nobody,
+        weights=design.weights if design else np.empty(0),
     )
     sizes = parts(space.problem.search.starts)
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
@@ -205,14 +204,14 @@ def _search(
     tops: list[float] = []
     futures = [executor.submit(search_chunk, *job) for job in work] if executor else []
     for index, job in enumerate(work):
-        if index and (clock.stop() or _agreed(tops) or _good_enough(space, relaxed, best)):
+        if index and (clock.over() or _agreed(tops) or _good_enough(space, design, best)):
             break
-        result = futures[index].result() if futures else search_chunk(*job, clock.stop)
-        tops.append(result.log_worth)
+        result = futures[index].result() if futures else search_chunk(*job, clock.over)
+        tops.append(result.log_value)
         done, evaluations = done + result.starts, evaluations + result.evaluations
-        if best is None or result.log_worth > best.log_worth:
+        if best is None or result.log_value > best.log_value:
             best = result
-        clock.tell(done, best.log_worth)
+        clock.tell(done, best.log_value)
     for future in futures:
         future.cancel()
     assert best is not None
@@ -225,40 +224,40 @@ def _agreed(tops: list[float]) -> bool:
     return len(best) == 2 and best[1] - best[0] < AGREEMENT
 
 
-def _good_enough(space: PlanSpace, relaxed: RelaxedDesign | None, best: SearchResult | None) -> bool:
+def _good_enough(space: PlanSpace, design: ApproximateDesign | None, best: SearchResult | None) -> bool:
     """Whether the best plan is so near its bound that more starts cannot pay."""
-    if relaxed is None or best is None or space.problem.compound:
+    if design is None or best is None or space.problem.compound:
         return False
-    worth = _worth(space, space.criterion(space.problem.criterion), best.configurations)
-    return worth >= (1.0 - GOOD_ENOUGH) * relaxed.bound
+    psi = _psi_of(space, space.criterion(space.problem.criterion), best.configurations)
+    return psi >= (1.0 - GOOD_ENOUGH) * design.bound
 
 
 def _choose(
     space: PlanSpace,
     criterion: Criterion,
-    relaxed: RelaxedDesign | None,
+    design: ApproximateDesign | None,
     rng: np.random.Generator,
     clock: _Clock,
 ) -> SearchResult:
     """From the candidates."""
     problem = space.problem
-    pool = np.asarray(problem.candidate_array)
-    allowed = np.flatnonzero(space.feasibility.mask(pool))
+    candidates = np.asarray(problem.candidate_array)
+    allowed = np.flatnonzero(space.feasibility.mask(candidates))
     if problem.discrepancy is not None:
-        chosen = choose_for_prediction(prediction_problem(problem, pool[allowed]), clock.stop)
-        return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
-    request = PoolProblem(
-        rows=space.model.whitened(pool[allowed]),
+        chosen = choose_for_prediction(prediction_problem(problem, candidates[allowed]), clock.over)
+        return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
+    request = ChoiceProblem(
+        rows=space.model.whitened(candidates[allowed]),
         criterion=criterion,
         prior=space.prior,
         size=problem.configurations,
         repeat=not problem.once_each,
-        weights=relaxed.weights if relaxed else np.empty(0),
+        weights=design.weights if design else np.empty(0),
         names=space.robot.parameter_names,
     )
-    chosen = choose(request, rng, clock.stop)
-    clock.tell(problem.search.starts, chosen.log_worth)
-    return SearchResult(pool[allowed[chosen.rows]], chosen.log_worth, chosen.starts, chosen.evaluations)
+    chosen = choose(request, rng, clock.over)
+    clock.tell(problem.search.starts, chosen.log_value)
+    return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
 
 
 # ── the answer ───────────────────────────────────────────────────────────────────────────────────────
@@ -267,13 +266,13 @@ def _choose(
 def _assemble(
     space: PlanSpace,
     target: Criterion,
-    relaxed: RelaxedDesign | None,
+    design: ApproximateDesign | None,
     proof: Proof | None,
-    found: SearchResult,
+    result: SearchResult,
     clock: _Clock,
 ) -> Plan:
     problem, robot = space.problem, space.robot
-    configurations = _rest_idle_joints(space, found.configurations)
+    configurations = _rest_idle_joints(space, result.configurations)
     configurations = configurations[visiting_order(configurations, robot)]
     matrix = space.model.at(configurations).sum(axis=0) + space.prior
     inverse, hidden = covariance(matrix)
@@ -281,21 +280,21 @@ def _assemble(
     shares = problem.weight_array / max(problem.weight_array.sum(), 1e-300)
     accuracy = float(np.sqrt(shares @ per**2)) if len(per) else float("nan")
     plain = problem.criterion == "test_pose" and not problem.compound
-    # For the paper's criterion the worth is that of the figure reported, to the last digit.
-    worth = accuracy**-2 if plain else _worth(space, target, configurations)
+    # For the paper's criterion Ψ is that of the figure reported, to the last digit.
+    psi = accuracy**-2 if plain else _psi_of(space, target, configurations)
     proven = proof is not None and proof.holds
     bound = float("nan")
-    if relaxed is not None:
-        bound = relaxed.bound if proven else max(relaxed.bound, worth)
+    if design is not None:
+        bound = design.bound if proven else max(design.bound, psi)
     name = "compound" if problem.compound else problem.criterion
     size, n = len(space.interest), problem.measurements
-    value = worth if problem.compound else reported_value(name, worth, size, n)
-    value_bound = bound if problem.compound or not relaxed else reported_value(name, bound, size, n)
+    value = psi if problem.compound else reported_value(name, psi, size, n)
+    value_bound = bound if problem.compound or not design else reported_value(name, bound, size, n)
     general = float("inf") if hidden.size else float(np.trace(space.general @ inverse))
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
     status = "singular" if hidden.size and status == "ok" else status
     combinations = space.identifiability.combinations
-    note = f" Not identifiable by any plan, held at nominal: {', '.join(combinations)}." if combinations else ""
+    note = f" Not identifiable by any plan, fixed at nominal: {', '.join(combinations)}." if combinations else ""
     if problem.discrepancy is not None:
         note += (
             " Chosen for a robot with systematic errors; value, bound and efficiency are for white noise alone."
@@ -311,14 +310,14 @@ def _assemble(
         value=value,
         value_bound=value_bound,
         lower_bound=value_bound if name in POSE_CRITERIA else float("nan"),
-        efficiency=_efficiency(name, worth, bound, value, value_bound) if relaxed else float("nan"),
-        bound="proven" if proven else "numerical" if relaxed else "none",
+        efficiency=_efficiency(name, psi, bound, value, value_bound) if design else float("nan"),
+        bound="proven" if proven else "numerical" if design else "none",
         status=status,
         message=STATUS[status] + note,
         seconds=clock.seconds,
         seed=problem.search.seed,
-        starts=found.starts,
-        evaluations=found.evaluations,
+        starts=result.starts,
+        evaluations=result.evaluations,
     )
     return Plan(
         robot=robot.name,
@@ -353,14 +352,14 @@ def _rest_idle_joints(space: PlanSpace, configurations: FloatArray) -> FloatArra
     return rested if space.feasibility.mask(rested).all() else configurations
 
 
-def _efficiency(name: str, worth: float, bound: float, value: float, value_bound: float) -> float:
+def _efficiency(name: str, psi: float, bound: float, value: float, value_bound: float) -> float:
     """In the criterion's own convention; for accuracies the quotient of the two figures reported."""
     if name in POSE_CRITERIA:
         return value_bound / value if np.isfinite(value) else 0.0
-    return efficiency(name, worth, bound)
+    return efficiency(name, psi, bound)
 
 
-def _worth(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
+def _psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
     """Ψ of a plan; 0 where it is blind to what the criterion needs."""
     matrix = space.model.at(configurations).sum(axis=0) + space.prior
     hidden = covariance(matrix)[1]
@@ -384,8 +383,8 @@ def _regular(matrix: FloatArray, hidden: FloatArray) -> FloatArray:
 
 def _parameter_deviations(space: PlanSpace, inverse: FloatArray, hidden: FloatArray) -> FloatArray:
     """(P,) standard deviations: infinite where this plan is blind, NaN where every plan is."""
-    kept = sorted(space.identifiability.kept)
-    unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(kept), bool)
-    std = np.full(len(kept) + len(space.identifiability.held), np.nan)
-    std[kept] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)))
+    free = sorted(space.identifiability.free)
+    unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(free), bool)
+    std = np.full(len(free) + len(space.identifiability.fixed), np.nan)
+    std[free] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)))
     return std

@@ -24,7 +24,7 @@ class Comparison:
 
     Attributes:
         label: ``"12"`` or ``"3x4"``.
-        proposed: The plan found.
+        proposed: The plan of the planner.
         random: (count,) ρ0 of random plans of the same size [m].
     """
 
@@ -34,7 +34,7 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers: label, sizes, proposed, lower bound, random {max, min, mean, median} [m]."""
-        found: dict[str, Any] = plain(
+        result: dict[str, Any] = plain(
             {
                 "label": self.label,
                 "configurations": len(self.proposed.configurations),
@@ -51,7 +51,7 @@ class Comparison:
                 },
             }
         )
-        return found
+        return result
 
 
 def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> list[Comparison]:
@@ -65,9 +65,9 @@ def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> l
     check_count("random", count)
     columns = []
     for k, r in sizes:
-        asked = replace(problem, configurations=k, repetitions=r)
-        random = random_accuracies(plan_space(asked), count, np.random.default_rng([problem.search.seed, k, r]))
-        columns.append(Comparison(str(k) if r == 1 else f"{k}x{r}", plan(asked), random))
+        request = replace(problem, configurations=k, repetitions=r)
+        random = random_accuracies(plan_space(request), count, np.random.default_rng([problem.search.seed, k, r]))
+        columns.append(Comparison(str(k) if r == 1 else f"{k}x{r}", plan(request), random))
     return columns
 
 
@@ -81,6 +81,6 @@ def random_accuracies(space: PlanSpace, count: int, rng: np.random.Generator) ->
         plans = min(batch, count - first)
         unit = space.model.at(space.feasibility.sample(rng, plans * size))
         matrices = unit.reshape(plans, size, *space.prior.shape).sum(axis=1) + space.prior
-        worth = criterion.worth_and_slope(matrices)[0]
-        values.append(np.where(worth > 0, np.maximum(worth, 1e-300) ** -0.5, np.inf))
+        psi = criterion.value_and_gradient(matrices)[0]
+        values.append(np.where(psi > 0, np.maximum(psi, 1e-300) ** -0.5, np.inf))
     return np.concatenate(values)

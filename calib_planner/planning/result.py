@@ -14,8 +14,8 @@ STATUS = {
     "ok": "The plan is complete.",
     "singular": "The plan predicts the test poses but leaves parameter combinations unseen: raise the number "
     "of configurations, the general weight or add test poses.",
-    "time_limit": "The time limit ended the search; this is the best plan found so far.",
-    "cancelled": "The search was cancelled; this is the best plan found so far.",
+    "time_limit": "The time limit ended the search; this is the best plan so far.",
+    "cancelled": "The search was cancelled; this is the best plan so far.",
 }
 """Every status a plan can have, with advice."""
 

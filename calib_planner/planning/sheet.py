@@ -1,7 +1,12 @@
 """The plan sheet: all that the person at the robot needs to measure a plan, and nothing that was not checked.
 
-The stops are the plan's configurations in the plan's order, which is that of visiting. Everything else is looked
-up (``stop_checks``) or follows (``timetable``).
+The visits are the plan's configurations in the plan's order. Everything else is checked (``check_visits``) or
+follows (``timetable``).
+
+A visit is *reachable* within the joint limits and if every constraint allows it that is not about the tracker.
+It is *visible* if every constraint about the tracker allows it (those with a ``station``); without such a
+constraint nothing is said about it. What the tracker would see — range, elevation, incidence — is computed
+wherever one station is known, be it from a constraint or from the instrument, and is no verdict.
 """
 
 from __future__ import annotations
@@ -47,7 +52,7 @@ HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class PlanSheet:
-    """A plan, stop by stop, m stops.
+    """A plan, visit by visit, m visits.
 
     Attributes:
         plan: The plan, its columns in the robot's joint order.
@@ -60,7 +65,7 @@ class PlanSheet:
     plan: Plan
     robot: Robot
     identity: str
-    checks: StopChecks
+    checks: VisitChecks
     timetable: Timetable
 
     @property
@@ -69,18 +74,18 @@ class PlanSheet:
         return np.asarray(self.plan.configurations * person_factors(self.robot))
 
     def total_travel(self, largest: bool, turning: bool) -> FloatArray:
-        """(m,) travel to every stop: the largest joint's or the sum; of turning or sliding joints [rad | m]."""
+        """(m,) travel to every visit: the largest joint's or the sum; of turning or sliding joints [rad | m]."""
         ways = np.abs(self.timetable.travel[:, self.robot.joint_is_revolute == turning])
         return np.asarray(ways.max(axis=1, initial=0.0) if largest else ways.sum(axis=1))
 
     def tightest(self) -> list[tuple[int, float]]:
-        """Per stop the joint nearest to a limit, as a share of its range, and its margin [rad | m]."""
+        """Per visit the joint nearest to a limit, as a share of its range, and its margin [rad | m]."""
         margins = self.checks.margins
         joints = (margins / np.diff(self.robot.joint_limits, axis=1)[:, 0]).argmin(axis=1)
         return [(int(j), float(row[j])) for j, row in zip(joints, margins, strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Head, joints, checks, time and stops as plain values, SI units; ``None`` stands for not checked."""
+        """Head, joints, checks, time and visits as plain values, SI units; ``None`` stands for not checked."""
         plan, checks, times = self.plan, self.checks, self.timetable
         promised = plan.values()
         joints = zip(
@@ -110,11 +115,11 @@ class PlanSheet:
             "speeds_from": times.pace.origin,
             "reachable": bool(checks.reachable.all()),
             "visible": None if checks.visible is None else bool(checks.visible.all()),
-            "stops": [self._stop(i) for i in range(len(plan.configurations))],
+            "stops": [self._visit(i) for i in range(len(plan.configurations))],
         }
 
-    def _stop(self, i: int) -> dict[str, Any]:
-        """What ``to_dict`` tells of one stop; keys with a unit at their end are for people."""
+    def _visit(self, i: int) -> dict[str, Any]:
+        """What ``to_dict`` tells of one visit; keys with a unit at their end are for people."""
         names, checks, times = self.plan.joint_names, self.checks, self.timetable
         joint, margin = self.tightest()[i]
         return {
@@ -166,7 +171,7 @@ def plan_sheet(
         plan=ordered,
         robot=robot,
         identity=plan_identity(plan),
-        checks=check_stops(robot, ordered.configurations, constraints, noise),
+        checks=check_visits(robot, ordered.configurations, constraints, noise),
         timetable=timetable(ordered, robot, usual_pace(robot) if pace is None else pace, start),
     )
 
@@ -206,16 +211,12 @@ def person_factors(robot: Robot) -> FloatArray:
     return np.where(robot.joint_is_revolute, 180.0 / np.pi, 1e3)
 
 
-# ── What was checked at each configuration, what came out, and what was not checked ─────────────────────────
-# Reachable: within the joint limits and allowed by every constraint that is not about the tracker. Visible:
-# allowed by every constraint that is (those with a ``station``); without any nothing is said about it. What the
-# tracker would see — range, elevation, incidence — is computed wherever one station is known, be it from a
-# constraint or from the instrument, and is no verdict.
+# ── checks ───────────────────────────────────────────────────────────────────────────────────────────
 
 VIEWS = (TrackerRange, TrackerElevation, ReflectorAcceptance, LineOfSight)
 """The constraints about the tracker."""
 LIMITS = "joint limits"
-NEVER = ("other objects in the cell", "the moves between the stops")
+NEVER = ("other objects in the cell", "the moves between the visits")
 """What nothing here can check."""
 
 
@@ -237,7 +238,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class StopChecks:
+class VisitChecks:
     """One verdict per configuration, N of them.
 
     Attributes:
@@ -265,9 +266,9 @@ class StopChecks:
         return [a + b for a, b in zip(self.reach_breaks, self.view_breaks, strict=True)]
 
 
-def check_stops(
+def check_visits(
     robot: Robot, configurations: FloatArray, constraints: Sequence[Constraint] = (), noise: Noise | None = None
-) -> StopChecks:
+) -> VisitChecks:
     """Check configurations (N, joints) [rad | m] against all that is known.
 
     Raises:
@@ -276,19 +277,19 @@ def check_stops(
     q = check_configurations("configurations", configurations, robot.joint_names)
     low, high = robot.joint_limits.T
     margins = np.minimum(q - low, high - q)
-    kept: dict[str, NDArray[np.bool_]] = {LIMITS: np.asarray(~robot.beyond_limits(q).any(axis=1))}
+    reach: dict[str, NDArray[np.bool_]] = {LIMITS: np.asarray(~robot.beyond_limits(q).any(axis=1))}
     seen: dict[str, NDArray[np.bool_]] = {}
     for constraint in constraints:
-        masks = seen if isinstance(constraint, VIEWS) else kept
+        masks = seen if isinstance(constraint, VIEWS) else reach
         allowed = constraint.allowed(robot, q)
         masks[constraint.name] = masks.get(constraint.name, True) & allowed
-    return StopChecks(
+    return VisitChecks(
         margins=frozen(margins),
-        reachable=frozen(np.all(list(kept.values()), axis=0)),
+        reachable=frozen(np.all(list(reach.values()), axis=0)),
         visible=frozen(np.all(list(seen.values()), axis=0)) if seen else None,
-        reach_breaks=_breaks(kept, len(q)),
+        reach_breaks=_breaks(reach, len(q)),
         view_breaks=_breaks(seen, len(q)),
-        checked=(*kept, *seen),
+        checked=(*reach, *seen),
         unchecked=_unchecked(constraints),
         sight=_sight(robot, q, constraints, noise),
     )

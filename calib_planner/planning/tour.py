@@ -1,4 +1,15 @@
-"""The order of visit: the same configurations with little joint travel between them."""
+"""The order of the visits, how far the joints travel from visit to visit, and how long the tour takes.
+
+``visiting_order`` sorts the same configurations for little joint travel between them. For ``timetable`` all
+joints of a move start and end together at rest. A smooth move runs fastest at PEAK times its mean speed: 15/8
+for the minimum-jerk polynomial 10τ³ − 15τ⁴ + 6τ⁵, 3/2 for a cubic. A joint with travel Δ_j and speed limit v_j
+stays below it when the move takes
+
+    T = max(SHORTEST, max_j PEAK·|Δ_j| / v_j).
+
+If it is not known where the robot stands before the first visit, the way there has no travel that could be
+stated, and its time is that from the farthest end of every joint's range, which is enough for any start.
+"""
 
 from __future__ import annotations
 
@@ -50,15 +61,7 @@ def _two_opt(tour: list[int], distance: FloatArray) -> None:
                     improved = True
 
 
-# ── How far the joints travel from stop to stop, and how long the tour takes ────────────────────────────────
-# In a move all joints start and stop together at rest. A smooth one runs fastest at PEAK times its mean speed:
-# 15/8 for the minimum-jerk polynomial 10τ³ − 15τ⁴ + 6τ⁵, 3/2 for a cubic. A joint with travel Δ_j and speed limit
-# v_j stays below it when the move takes
-#
-#     T = max(SHORTEST, max_j PEAK·|Δ_j| / v_j).
-#
-# Where the robot stands before the first stop is known or not. If not, its way there has no travel that could be
-# stated, and its time is that from the farthest end of every joint's range: enough for any start.
+# ── the timetable ────────────────────────────────────────────────────────────────────────────────────────
 
 PEAK = 1.875
 """Fastest over mean speed of a minimum-jerk move."""
@@ -97,11 +100,11 @@ class Pace:
 
 @dataclass(frozen=True, eq=False)
 class Timetable:
-    """When the robot is where; stops in the order of the plan.
+    """When the robot is where; visits in the order of the plan.
 
     Attributes:
         pace: What it was made with.
-        travel: (m, joints) joint coordinates at a stop minus those at the stop before [rad | m]; the first row
+        travel: (m, joints) joint coordinates at a visit minus those at the visit before [rad | m]; the first row
             is NaN if the start is not known.
         arrive, leave: (m,) seconds from the start.
     """
@@ -135,7 +138,7 @@ def timetable(plan: Plan, robot: Robot, pace: Pace, start: ArrayLike | None = No
 
     Args:
         plan: Its ``joint_names`` have to be in the robot's order.
-        robot: Its limits say how far the first stop may be.
+        robot: Its limits say how far the first visit may be.
         pace: Speeds and standstill.
         start: (joints,) where the robot stands [rad | m]; ``None`` if that is not known.
 

@@ -4,6 +4,6 @@
 """
 
 from calib_planner.report.page import write_report
-from calib_planner.report.plan_sheet import write_sheet_page
+from calib_planner.report.plan_sheet import write_sheet, write_sheet_page
 from calib_planner.report.provenance import InputFile, Provenance, provenance
 from calib_planner.report.render import render

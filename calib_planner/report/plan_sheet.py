@@ -19,7 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.io import write_text
+from calib_planner.io import (
+    SHEET_FILES,
+    make_folder,
+    write_sheet_csv,
+    write_sheet_yaml,
+    write_text,
+    write_trajectory,
+)
 from calib_planner.planning import NEVER, POSE_CRITERIA, PlanSheet
 from calib_planner.report.render import TEMPLATES, Drawing, Shape, render, shape
 from calib_planner.report.scene import bodies
@@ -47,6 +54,24 @@ def write_sheet_page(path: str | Path, sheet: PlanSheet, field: str = "output") 
         InputError: The path cannot be written; names ``field``.
     """
     write_text(path, sheet_page(sheet), field)
+
+
+def write_sheet(folder: str | Path, sheet: PlanSheet, field: str = "output") -> list[str]:
+    """Write page, CSV, YAML and trajectory of a sheet into a folder, which is made; returns the files' names.
+
+    No trajectory is written if a configuration is not reachable; an older one in the folder is removed.
+
+    Raises:
+        InputError: The folder cannot be made or written to; names ``field``.
+    """
+    target, reachable = make_folder(folder, field), bool(sheet.checks.reachable.all())
+    if not reachable:
+        (target / SHEET_FILES[-1]).unlink(missing_ok=True)
+    writers = (write_sheet_page, write_sheet_csv, write_sheet_yaml, write_trajectory)
+    names = SHEET_FILES if reachable else SHEET_FILES[:-1]
+    for name, write in zip(names, writers, strict=False):
+        write(target / name, sheet, field)
+    return list(names)
 
 
 def sheet_page(sheet: PlanSheet) -> str:

@@ -1,4 +1,4 @@
-"""Elementary transforms: the letters in which a robot is written, eq. (2).
+"""Elementary transforms, in which a robot is written, eq. (2), and Denavit–Hartenberg tables as such chains.
 
 Each element is a translation along or a rotation about one coordinate axis of the frame that the elements
 before it have built. Its amount is
@@ -8,6 +8,20 @@ before it have built. Its amount is
 with the nominal constant ``value`` [m | rad], the deviation ``δ`` of the error parameter that it carries,
 if any, and the coordinate ``q_joint`` of the joint that moves it, if any. Every element may carry one named
 parameter; a parameter belongs to exactly one element.
+
+Row i of a Denavit–Hartenberg table is four elements. Standard (distal: Denavit and Hartenberg 1955, Paul), from
+frame i−1 to i, with joint i about or along z of frame i−1:
+
+    Rz(θ) · Tz(d) · Tx(a) · Rx(α)
+
+Modified (proximal: Khalil and Kleinfinger 1986, Craig), with joint i about or along z of frame i, and the a and
+α of the row that Craig numbers i−1:
+
+    Rx(α) · Tx(a) · Rz(θ) · Tz(d)
+
+The table's θ of a revolute joint and d of a prismatic one are constants to which sign · q is added. All four
+are named parameters, ``<joint>.theta``, ``.d``, ``.a`` and ``.alpha``, and their values are the table's: what
+is identified goes straight back into it, whatever the joint's sign.
 """
 
 from __future__ import annotations
@@ -97,20 +111,7 @@ def pose_elements(prefix: str, xyz: FloatArray, rpy: FloatArray) -> tuple[Elemen
     return translations + nominal + errors
 
 
-# ── Denavit–Hartenberg tables, standard and modified, as chains of elementary transforms ────────────────────
-# Row i of a table is four elements. Standard (distal: Denavit and Hartenberg 1955, Paul), from frame i−1 to i,
-# with joint i about or along z of frame i−1:
-#
-#     Rz(θ) · Tz(d) · Tx(a) · Rx(α)
-#
-# Modified (proximal: Khalil and Kleinfinger 1986, Craig), with joint i about or along z of frame i, and the a and
-# α of the row that Craig numbers i−1:
-#
-#     Rx(α) · Tx(a) · Rz(θ) · Tz(d)
-#
-# The table's θ of a revolute joint and d of a prismatic one are constants to which sign · q is added. All four
-# are named parameters, ``<joint>.theta``, ``.d``, ``.a`` and ``.alpha``, and their values are the table's: what
-# is identified goes straight back into it, whatever the joint's sign.
+# ── Denavit–Hartenberg tables ─────────────────────────────────────────────────────────────────────────
 
 ROW_TYPES = ("revolute", "prismatic", "fixed")
 STANDARD = (("Rz", "theta"), ("Tz", "d"), ("Tx", "a"), ("Rx", "alpha"))

@@ -2,7 +2,7 @@
 
 The columns of the stacked, weighted Jacobian are scaled to unit length and taken in order of priority. A
 column that lies (to the tolerance) in the span of those already taken is not identifiable beside them: it is
-held at its nominal value, and the combination that the data cannot see is named. Priority: base pose and
+fixed at its nominal value, and the combination that the data cannot see is named. Priority: base pose and
 target offsets first — without them no residual means anything — then the order of the request.
 
 Only the triangle R of the scaled columns (QR) is worked on: it has the same lengths, angles and combinations as
@@ -37,24 +37,24 @@ class Identifiability:
     """What can be identified.
 
     Attributes:
-        kept: Indices of the parameters to solve for, in priority order.
-        combinations: For each parameter held, the combination of parameters whose change no measurement
+        free: Indices of the parameters to solve for, in priority order.
+        combinations: For each parameter fixed, the combination of parameters whose change no measurement
             shows, e.g. ``"1·joint_1.offset - 1·base.rz"`` (coefficients in parameter units).
-        held: Index of the parameter held for each combination.
-        directions: (held, P) the same combinations as changes of the parameters, 1 for the one held.
-        lengths: For each parameter kept, how far it moves the points beside its predecessors, per unit
+        fixed: Index of the parameter fixed for each combination.
+        directions: (fixed, P) the same combinations as changes of the parameters, 1 for the one fixed.
+        lengths: For each free parameter, how far it moves the points beside its predecessors, per unit
             (length of the stacked column's part).
     """
 
-    kept: tuple[int, ...]
+    free: tuple[int, ...]
     combinations: tuple[str, ...]
-    held: tuple[int, ...]
+    fixed: tuple[int, ...]
     directions: FloatArray
     lengths: tuple[float, ...]
 
     @property
     def rank(self) -> int:
-        return len(self.kept)
+        return len(self.free)
 
 
 def analyse(
@@ -77,54 +77,56 @@ def analyse(
     order = first + [i for i in range(len(names)) if i not in first]
     columns = np.ascontiguousarray(unit.T)
     basis = np.empty((min(unit.shape), len(unit)))
-    triangle = np.zeros((len(basis), len(basis)))  # of the columns kept: their coordinates in the basis
-    kept: list[int] = []
-    held: list[int] = []
+    triangle = np.zeros((len(basis), len(basis)))  # of the free columns: their coordinates in the basis
+    free: list[int] = []
+    fixed: list[int] = []
     shares: list[FloatArray] = []
     lengths: list[float] = []
     least = np.zeros(len(names)) if shortest is None else shortest
     for i in order:
-        known = basis[: len(kept)]
+        known = basis[: len(free)]
         share = known @ columns[i]
         rest = columns[i] - share @ known
         again = known @ rest  # twice is enough (Kahan): orthogonal to rounding
         share += again
         rest -= again @ known
         size = float(np.sqrt(rest @ rest))
-        if size > tolerance and size * scale[i] > least[i] and len(kept) < len(basis):
-            triangle[: len(kept), len(kept)] = share
-            triangle[len(kept), len(kept)] = size
-            basis[len(kept)] = rest / size
-            kept.append(i)
+        if size > tolerance and size * scale[i] > least[i] and len(free) < len(basis):
+            triangle[: len(free), len(free)] = share
+            triangle[len(free), len(free)] = size
+            basis[len(free)] = rest / size
+            free.append(i)
             lengths.append(size * float(scale[i]))
         else:
-            held.append(i)
+            fixed.append(i)
             shares.append(share)
-    directions = _directions(triangle[: len(kept), : len(kept)], shares, scale, kept, held)
-    said = (np.where(np.abs(d) * scale > SMALL * scale[i], d, 0.0) for d, i in zip(directions, held, strict=True))
-    combinations = tuple(describe(d, names, first=i) for d, i in zip(said, held, strict=True))
-    return Identifiability(tuple(kept), combinations, tuple(held), directions, tuple(lengths))
+    directions = _directions(triangle[: len(free), : len(free)], shares, scale, free, fixed)
+    combinations = tuple(
+        describe(np.where(np.abs(d) * scale > SMALL * scale[i], d, 0.0), names, first=i)
+        for d, i in zip(directions, fixed, strict=True)
+    )
+    return Identifiability(tuple(free), combinations, tuple(fixed), directions, tuple(lengths))
 
 
 def _directions(
-    triangle: FloatArray, shares: list[FloatArray], scale: FloatArray, kept: list[int], held: list[int]
+    triangle: FloatArray, shares: list[FloatArray], scale: FloatArray, free: list[int], fixed: list[int]
 ) -> FloatArray:
-    """(held, P) changes of the parameters that no point shows: the one held by one, and what undoes it.
+    """(fixed, P) changes of the parameters that no point shows: the fixed one by one, and what undoes it.
 
-    ``triangle`` (kept, kept) and ``shares``, each (those kept before it,), are the columns kept and held in the
-    orthonormal basis.
+    ``triangle`` (free, free) and ``shares``, each (the free ones before it,), are the free and the fixed columns
+    in the orthonormal basis.
     """
     from scipy.linalg import solve_triangular  # 0.1 s, which only who analyses parameters waits for
 
-    directions = np.zeros((len(held), len(scale)))
-    directions[np.arange(len(held)), held] = 1.0
-    if kept and held:
-        columns = np.zeros((len(kept), len(held)))
+    directions = np.zeros((len(fixed), len(scale)))
+    directions[np.arange(len(fixed)), fixed] = 1.0
+    if free and fixed:
+        columns = np.zeros((len(free), len(fixed)))
         for column, share in zip(columns.T, shares, strict=True):
             column[: len(share)] = share
         weights = solve_triangular(triangle, columns, check_finite=False)
         weights[np.abs(weights) <= ROUNDING] = 0.0
-        directions[:, kept] = -weights.T * scale[held][:, None] / scale[kept]
+        directions[:, free] = -weights.T * scale[fixed][:, None] / scale[free]
     return directions
 
 

@@ -14,7 +14,7 @@ J = [∂p/∂q; L ω] is exact where it matters: with φ = log(R_g Rᵀ), a turn
     (JᵀJ + λ d I) Δ = Jᵀr,    d = max diag(JᵀJ),
 
 the shortest where many would do, with the damping λ of each row raised after a failure and lowered after a
-success; joints at a bound that the step would cross are held. Where the iteration rests without having reached
+success; joints at a bound that the step would cross do not move. Where the iteration rests without having reached
 the goal, the rest may be a saddle (an arm stretched out that has to bend: the gradient along the bend is zero
 by symmetry). Such rows start again a little to either side along the directions that hardly move the tip, and
 the best end counts, the nearest among equals.
@@ -151,15 +151,15 @@ def _descend(robot: Robot, goals: Goals, start: FloatArray, low: FloatArray, hig
 def _step(
     r: FloatArray, jacobian: FloatArray, damping: FloatArray, q: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """(N, joints) the damped step, held at bounds, of at most the longest length."""
+    """(N, joints) the damped step, which does not cross bounds, of at most the longest length."""
     gradient = np.einsum("nij,ni->nj", jacobian, r)
-    held = ((q <= low) & (gradient < 0)) | ((q >= high) & (gradient > 0))
-    free = np.where(held[:, None, :], 0.0, jacobian)
+    fixed = ((q <= low) & (gradient < 0)) | ((q >= high) & (gradient > 0))
+    free = np.where(fixed[:, None, :], 0.0, jacobian)
     normal = np.einsum("nij,nik->njk", free, free)
     n = q.shape[1]
     largest = normal[:, range(n), range(n)].max(axis=1, keepdims=True) + np.finfo(float).tiny ** 0.5
-    normal[:, range(n), range(n)] += (damping[:, None] + 1e-15) * largest + np.where(held, 1.0, 0.0)
-    step: FloatArray = np.linalg.solve(normal, np.where(held, 0.0, gradient)[:, :, None])[:, :, 0]
+    normal[:, range(n), range(n)] += (damping[:, None] + 1e-15) * largest + np.where(fixed, 1.0, 0.0)
+    step: FloatArray = np.linalg.solve(normal, np.where(fixed, 0.0, gradient)[:, :, None])[:, :, 0]
     length = np.abs(step).max(axis=1, keepdims=True)
     return step * np.minimum(1.0, LONGEST_STEP / np.maximum(length, LONGEST_STEP))
 

@@ -1,9 +1,32 @@
-"""The chain with symbols in place of numbers: what forward kinematics and its derivatives are made of.
+"""Forward kinematics and all its derivatives as one straight-line program of array operations.
 
-A symbol is a signed reference to a node; a node is an operation on earlier nodes, a scalar (the constant part of
-an amount) or a vector (a joint's coordinates over many configurations). Equal operations become one node,
-products with 0 and ±1 vanish. ``trace`` walks a chain once and names the nodes of everything asked for; the
-derivation is in ``program``, which turns them into array operations.
+Derivation. Let the frame before element e have origin o_e and axes R_e, all in the base frame, and let
+w_e = R_e·(unit axis of e). Differentiating the product (2) with respect to the amount of e gives, for a
+point p carried by the chain,
+
+    column_e = ∂p/∂amount_e = w_e                for a translation
+                              w_e × (p − o_e)    for a rotation                            (J of eq. (3))
+
+and, because ∂w/∂amount = w_e × w for everything behind a rotation e,
+
+    ∂²p/∂amount_a ∂amount_b = w_a × column_b     with a before b, a a rotation; 0 if a is a translation.
+
+So axes and columns of the elements are all that positions, the identification Jacobian and its joint
+derivatives need.
+
+``trace`` walks the chain once with symbols in place of numbers. A symbol is a signed reference to a node; a
+node is an operation on earlier nodes, a scalar (the constant part of an amount) or a vector (a joint's
+coordinates over many configurations). Equal operations become one node, products with 0 and ±1 vanish, and so
+does what nobody wants.
+
+``compile_program`` turns what is left into operations on blocks of configurations, one contiguous vector per
+scalar quantity (structure of arrays), in buffers that stay in the cache. Sines and cosines of all joints come
+from one tangent of the half angle,
+
+    t = tan(q/2),   d = 2/(1 + t²),   cos q = d − 1,   sin q = t·d,
+
+which NumPy vectorises where it does not vectorise sine and cosine. The program depends on the chain's *structure*
+(which amounts are zero or quarter turns), not on its numbers, so that one program serves a whole identification.
 """
 
 from __future__ import annotations
@@ -193,7 +216,7 @@ def first_turn(structure: Structure) -> int:
 
 @dataclass(frozen=True)
 class Trace:
-    """What was asked for, in symbols.
+    """The wanted quantities, in symbols.
 
     Attributes:
         tracer: Holds the nodes.
@@ -264,29 +287,7 @@ def _element_sign(structure: Structure, e: int) -> int:
     return int(flat[e][2])
 
 
-# ── Forward kinematics and all its derivatives as one straight-line program of array operations ─────────────
-# Derivation. Let the frame before element e have origin o_e and axes R_e, all in the base frame, and let
-# w_e = R_e·(unit axis of e). Differentiating the product (2) with respect to the amount of e gives, for a
-# point p carried by the chain,
-#
-#     column_e = ∂p/∂amount_e = w_e                for a translation
-#                               w_e × (p − o_e)    for a rotation                            (J of eq. (3))
-#
-# and, because ∂w/∂amount = w_e × w for everything behind a rotation e,
-#
-#     ∂²p/∂amount_a ∂amount_b = w_a × column_b     with a before b, a a rotation; 0 if a is a translation.
-#
-# So axes and columns of the elements are all that positions, the identification Jacobian and its joint
-# derivatives need. ``compile_program`` walks the chain once with symbols in place of numbers. Products with
-# 0 and ±1, shared subexpressions and results that nobody asked for vanish there; what is left runs over a
-# block of configurations at a time, one contiguous vector per scalar quantity (structure of arrays), in
-# buffers that stay in the cache. Sines and cosines of all joints come from one tangent of the half angle,
-#
-#     t = tan(q/2),   d = 2/(1 + t²),   cos q = d − 1,   sin q = t·d,
-#
-# which NumPy vectorises where it does not vectorise sine and cosine. The program depends on the chain's
-# *structure* (which amounts are zero or quarter turns), not on its numbers, so that one program serves a whole
-# identification.
+# ── the program ──────────────────────────────────────────────────────────────────────────────────────
 
 BLOCK = 2048
 """Configurations per pass: the live vectors of a six-joint robot then fit the second-level cache."""
@@ -345,18 +346,18 @@ class Program:
         scratch = np.empty((self.scratch, width), dtype)
         angles, waves = np.empty((len(self.turns), width), dtype), np.empty((2, len(self.turns), width), dtype)
         for start in range(0, count, BLOCK):
-            stop = min(start + BLOCK, count)
-            block = out[:, start:stop]
+            end = min(start + BLOCK, count)
+            block = out[:, start:end]
             table[: self.rows] = block
             for slot, joint in self.joints:
-                table[slot] = q[joint, start:stop]
-            if start == 0 or stop - start < width:
-                views = scratch[:, : stop - start]
+                table[slot] = q[joint, start:end]
+            if start == 0 or end - start < width:
+                views = scratch[:, : end - start]
                 for slot, register in self.registers:
                     table[slot] = views[register]
                 for index, (_, _, cos, sin) in enumerate(self.turns):
-                    table[cos], table[sin] = waves[:, index, : stop - start]
-            self._turn(q[:, start:stop], numbers, angles[:, : stop - start], waves[:, :, : stop - start])
+                    table[cos], table[sin] = waves[:, index, : end - start]
+            self._turn(q[:, start:end], numbers, angles[:, : end - start], waves[:, :, : end - start])
             for ufunc, a, b, slot in self.vectors:
                 ufunc(table[a], table[b], table[slot])
             for row, sign, slot in self.copies:
@@ -402,7 +403,7 @@ def compile_program(structure: Structure) -> Program:
 
     The chain may be traced in the base frame, or in the frame behind its first turning joint with the results
     turned into the base frame at the end: an arm that moves in a plane there is mostly zeros. The shorter
-    program is kept.
+    program is used.
     """
     candidates = [_lay_out(trace(structure, split)) for split in (0, first_turn(structure))]
     return min(candidates, key=lambda program: len(program.vectors) + len(program.copies))
@@ -449,20 +450,20 @@ def _lay_out(traced: Trace) -> Program:
         elif not tracer.is_vector[node]:
             constants.append((home[node], node))
     vectors = []
-    held: dict[int, int] = {}
+    register_of: dict[int, int] = {}
     for step, node in enumerate(order):
         if node not in home:
             register = free.pop() if free else used
             used = max(used, register + 1)
-            held[node] = register
+            register_of[node] = register
             home[node] = slots
             registers.append((slots, register))
             slots += 1
         op, a, b = tracer.nodes[node]
         vectors.append((_UFUNCS[op], home[a], home[b], home[node]))
         for operand in _operands(tracer, node):
-            if last_use[operand] == step and operand in held:
-                free.append(held.pop(operand))
+            if last_use[operand] == step and operand in register_of:
+                free.append(register_of.pop(operand))
     copies = [
         (row, sign, home[node] if sign else 0)
         for row, (sign, node) in enumerate(outputs)
@@ -512,10 +513,10 @@ def _turns(
         op, a, _ = tracer.nodes[node]
         if op in ("cos", "sin") and tracer.is_vector[node]:
             places.setdefault(a, {})[op] = home[node]
-    found = []
+    turns = []
     for angle, place in places.items():
-        found.append((*_angle(tracer, angle), place.get("cos", nowhere), place.get("sin", nowhere)))
-    return tuple(found)
+        turns.append((*_angle(tracer, angle), place.get("cos", nowhere), place.get("sin", nowhere)))
+    return tuple(turns)
 
 
 def _needed(tracer: Tracer, outputs: list[Ref]) -> list[int]:

@@ -1,6 +1,8 @@
-"""How points move with parameters and joints at a batch of configurations: eq. (3) and one order beyond.
+"""Where the robot is at a batch of configurations, and how points move with parameters and joints.
 
-From the axes w_e and columns of the elements (see ``program``) with e_a the element of parameter a and e_k
+``Posture`` holds the frames of the chain, ``Linearisation`` eq. (3) and one order beyond.
+
+From the axes w_e and columns of the elements (see ``kinematics``) with e_a the element of parameter a and e_k
 that of joint k, both rotations:
 
     ∂J_a/∂q_k = w_k × J_a     where e_k is before or at e_a,
@@ -126,7 +128,7 @@ def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
     return out
 
 
-# ── Where every part of the robot is, for many configurations at once ───────────────────────────────────────
+# ── posture ──────────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, eq=False)

@@ -210,10 +210,10 @@ def _as_origin(r: FloatArray, p: FloatArray) -> Origin:
 def _rebuilt(robot: Robot, elements: tuple[Element, ...]) -> Robot:
     """The robot with other elements, its parameters and levels as far as they are still there."""
     there = {e.parameter for e in elements} | {e.parameter for b in robot.targets for e in b}
-    kept = {k: tuple(n for n in names if n in there) for k, names in robot.levels.items()}
+    levels = {k: tuple(n for n in names if n in there) for k, names in robot.levels.items()}
     return replace(
         robot,
         elements=elements,
-        levels={k: names for k, names in kept.items() if names},
+        levels={k: names for k, names in levels.items() if names},
         parameter_names=tuple(n for n in robot.parameter_names if n in there),
     )

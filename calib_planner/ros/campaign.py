@@ -77,20 +77,20 @@ class Announced:
     Attributes:
         plan_id: Its name.
         plan: The plan.
-        stops: Number of the stop of each row.
+        numbers: Number of the campaign's configuration in each row.
         role: What they are for, ``fit`` or ``validation``.
     """
 
     plan_id: str
     plan: Plan
-    stops: tuple[int, ...]
+    numbers: tuple[int, ...]
     role: str
 
     def covers(self, stop: int, state: CampaignState) -> bool:
         """Whether the stop is in it as it is now: for the same purpose, and as often."""
-        if stop not in self.stops or state.stops[stop].role != self.role:
+        if stop not in self.numbers or state.configurations[stop].role != self.role:
             return False
-        return bool(self.plan.repetitions[self.stops.index(stop)] == state.stops[stop].times)
+        return bool(self.plan.repetitions[self.numbers.index(stop)] == state.configurations[stop].times)
 
     def part(self, row: int) -> Plan:
         """One row, to be measured once."""
@@ -100,8 +100,10 @@ class Announced:
 
 def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
     """All stops of ``role`` that were measured or are to be: what the identifier matches standstills to."""
-    measured = {r.index for r in state.rows}
-    stops = [i for i, s in enumerate(state.stops) if s.role == role and (i in measured or i in state.queue)]
+    measured = {r.index for r in state.measurements}
+    stops = [
+        i for i, s in enumerate(state.configurations) if s.role == role and (i in measured or i in state.queue)
+    ]
     problem, last = state.problem, state.rounds[-1] if state.rounds else None
     poses = problem.test_pose_array
     accuracy = float("nan") if last is None else last.accuracy
@@ -109,8 +111,8 @@ def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
         robot=problem.robot.name,
         parameters=problem.robot.parameter_names,
         joint_names=problem.robot.joint_names,
-        configurations=np.array([state.stops[i].q for i in stops]),
-        repetitions=np.array([state.stops[i].times for i in stops]),
+        configurations=np.array([state.configurations[i].q for i in stops]),
+        repetitions=np.array([state.configurations[i].times for i in stops]),
         test_poses=poses,
         weights=np.full(len(poses), 1.0 / len(poses)),
         sigma=problem.instrument.typical,
@@ -138,7 +140,6 @@ ANYWHERE = (
     Measurement.REJECTED_TIME_SKEW,
     Measurement.REJECTED_CLOCK_OFFSET,
     Measurement.REJECTED_OTHER_FRAME,
-    Measurement.REJECTED_BAD_JOINTS,
     Measurement.REJECTED_NOT_STORED,
 )
 """Rejections that another configuration would meet as well."""
@@ -231,7 +232,7 @@ class Measuring:
         Raises:
             InputError: A measurement of other joints.
         """
-        known = any(r.number == message.id for r in state.rows)
+        known = any(r.number == message.id for r in state.measurements)
         if message.status not in (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER):
             if known:
                 return state.withdrawn(int(message.id), cut(message.reason, 300) or "undone")
@@ -239,10 +240,10 @@ class Measuring:
             return state
         self._spoilt = ""
         plan = self._plans.get(message.plan_id)
-        if known or plan is None or message.configuration_index >= len(plan.stops):
+        if known or plan is None or message.configuration_index >= len(plan.numbers):
             return state
         points = np.array([[p.x, p.y, p.z] for p in message.points])
-        stop = plan.stops[message.configuration_index]
+        stop = plan.numbers[message.configuration_index]
         return state.measured(stop, _joints(message, state), points, int(message.id))
 
     def _rejected(self, message: Measurement) -> None:
@@ -252,7 +253,7 @@ class Measuring:
         visit.said, visit.anywhere = cut(message.reason, 300), message.status in ANYWHERE
         # Points tell a standstill that was rejected from one that was none, and may become one yet.
         plan, row = self._plans.get(message.plan_id), message.configuration_index
-        here = plan is not None and row < len(plan.stops) and plan.stops[row] == visit.action.index
+        here = plan is not None and row < len(plan.numbers) and plan.numbers[row] == visit.action.index
         visit.final = here and len(message.points) > 0
 
     # ── one step further ─────────────────────────────────────────────────────────────────────────────
@@ -309,7 +310,7 @@ class Measuring:
         if not self._execution.ready:
             self._wait_for(f"nobody offers {settings.execute_action}: is the robot's node there?")
         elif not self.waiting or self._due():
-            stamp, row = self._node.get_clock().now().nanoseconds, plan.stops.index(visit.action.index)
+            stamp, row = self._node.get_clock().now().nanoseconds, plan.numbers.index(visit.action.index)
             goal = plan_to_message(plan.part(row), plan.plan_id, stamp, settings.frame_id)
             self._execution.send(ExecutePlan.Goal(plan=goal, dwell=settings.dwell))
             visit.next("moving")
@@ -437,10 +438,10 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
         state=_state(state, waiting),
         outcome=OUTCOME[state.outcome],
         round=len(state.rounds),
-        measured=len(state.of_role(FIT)),
+        measured=len(state.measurements_of(FIT)),
         left=left,
         budget=problem.budget,
-        validated=len(state.of_role(VALIDATION)),
+        validated=len(state.measurements_of(VALIDATION)),
         validation=problem.validation,
         excluded=len(state.exclusions),
         predicted_accuracy=NAN if last is None or math.isinf(last.accuracy) else last.accuracy,

@@ -7,7 +7,6 @@ be the node's own or a shipped one (never a path), and sizes are bounded.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,11 @@ from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.io import config_folder, read_constraints
 from calib_planner.planning import (
+    Callback,
     Candidates,
     Constraint,
     Plan,
     PlanProblem,
-    Progress,
     Search,
     plan,
     usual_discrepancy,
@@ -65,7 +64,7 @@ def answer(
     request: Any,
     settings: PlannerParameters,
     own: Model | NotReady,
-    callback: Callable[[Progress], bool | None] | None = None,
+    callback: Callback | None = None,
 ) -> Answer:
     """Make the plan of a request; every fault of the request becomes an ``Answer``."""
     try:

@@ -10,4 +10,4 @@ from calib_planner.simulation.cell import (
 from calib_planner.simulation.faults import Faults
 from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour, make_tour
 from calib_planner.simulation.streams import Message, Rates, Streams, play
-from calib_planner.simulation.world import World, simulated
+from calib_planner.simulation.world import World, simulate_campaign, simulated

@@ -15,13 +15,28 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_planner.arrays import FloatArray, check_count
-from calib_planner.campaign import Instrument, Measure, Unreachable
+from calib_planner.campaign import (
+    CampaignProblem,
+    CampaignResult,
+    CampaignState,
+    Instrument,
+    Measure,
+    Unreachable,
+    run_campaign,
+)
 from calib_planner.identification import JointCorrections, phases
 from calib_planner.robot import Robot
-from calib_planner.simulation.cell import Purpose, SimulatedCell, directions, draws
+from calib_planner.simulation.cell import (
+    Purpose,
+    SimulatedCell,
+    directions,
+    draws,
+    independent_seeds,
+    random_deviations,
+)
 from calib_planner.simulation.faults import NEVER, Faults
 from calib_planner.simulation.motion import Stand
-from calib_planner.tracker import LaserTracker
+from calib_planner.tracker import LaserTracker, Noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +85,17 @@ class World:
             moved = stand.arrival >= self.faults.reseat_at
             points = np.where(moved[:, None, None], elsewhere, points)
         return points + self._swing(stand)[:, None, :]
+
+    def errors(self, predicted: Callable[[FloatArray], FloatArray], poses: FloatArray) -> FloatArray:
+        """(K,) rms distance over the targets [m] between ``predicted`` points and the true ones.
+
+        Args:
+            predicted: Points (K, targets, 3) [m] at configurations, such as ``Estimate.positions``.
+            poses: (K, joints) configurations at which the robot stands still [rad | m].
+        """
+        stand = Stand(poses, np.arange(len(poses)), np.full(len(poses), np.inf))
+        off = predicted(poses) - self.targets(stand)
+        return np.asarray(np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1)))
 
     @cached_property
     def _reseated(self) -> Robot:
@@ -218,3 +244,30 @@ def simulated(world: World, seed: int, reaches: Callable[[FloatArray], bool] = l
         return np.asarray((points + world.cell.noise(points, rng))[0])
 
     return measure
+
+
+def simulate_campaign(
+    problem: CampaignProblem,
+    seed: int,
+    sigma: float,
+    noise: Noise | None = None,
+    transmission: float = 0.0,
+    watch: Callable[[CampaignState], None] = lambda state: None,
+) -> tuple[CampaignResult, World, dict[str, float]]:
+    """Run a campaign with a simulated robot of hidden errors.
+
+    Args:
+        seed: Of the true errors and of the tracker's noise.
+        sigma: True standard deviation of one coordinate [m].
+        noise: The tracker's true noise, in place of ``sigma``.
+        transmission: Rms error of the joints' transmissions [rad].
+        watch: Called with every state.
+
+    Returns:
+        The result, the world that was measured, and the true deviations by parameter [m | rad].
+    """
+    truth_seed, noise_seed = independent_seeds(seed, 2)
+    errors = random_deviations(problem.robot, truth_seed)
+    cell = SimulatedCell(problem.robot, errors, sigma, noise)
+    world = World(cell, Faults(transmission_error=transmission), truth_seed)
+    return run_campaign(problem, simulated(world, noise_seed), watch), world, errors

@@ -1,4 +1,4 @@
-"""What the laser tracker is worth: the covariance of a measured point, and what it can see from its station."""
+"""The laser tracker: the covariance of a point that it measures, and what it can see from its station."""
 
 from calib_planner.tracker.noise import Isotropic, LaserTracker, Noise, covariance_gradient
 from calib_planner.tracker.visibility import (

@@ -1,4 +1,4 @@
-"""What the tracker's coordinates are worth: the covariance of one measured point.
+"""How precise the tracker's coordinates are: the covariance of one measured point.
 
 Isotropic (assumption A3 of the paper): σ² I. A laser tracker measures a range d and two angles from its
 station; with u the unit vector along the beam, h horizontal and v = u × h completing them,
@@ -6,7 +6,7 @@ station; with u the unit vector along the beam, h horizontal and v = u × h comp
     Σ(p) = s_r² u uᵀ + s_a² h hᵀ + s_e² v vᵀ,
     s_r = range + range_per_metre·d,   s_a = azimuth·ρ,   s_e = elevation·d,
 
-with ρ the distance from the station's vertical axis. Distance and direction thus decide what a point is worth.
+with ρ the distance from the station's vertical axis. Distance and direction thus decide how precise a point is.
 """
 
 from __future__ import annotations
@@ -107,4 +107,4 @@ def covariance_gradient(noise: Noise, points: FloatArray) -> FloatArray:
     """∂Σ/∂p, shape (…, 3, 3, 3) with the coordinate of p last, by complex steps: exact to rounding."""
     step = 1e-30
     moved = points[..., None, :] + 1j * step * np.eye(3)
-    return np.moveaxis(noise.covariance(moved).imag / step, -3, -1)
+    return np.ascontiguousarray(np.moveaxis(noise.covariance(moved).imag / step, -3, -1))

@@ -8,7 +8,7 @@ from worlds import POSE, SIGMA, achieved, campaign, kuka, planar, world_of
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, UnknownNameError, identify, plan
 from calib_planner.campaign import CampaignProblem, Measure, begin, decide, run_campaign
-from calib_planner.campaign.batch import APART
+from calib_planner.campaign.finish import APART
 from calib_planner.identification import IdentificationProblem
 from calib_planner.planning import Search, plan_for_accuracy
 from calib_planner.simulation import simulated

@@ -45,8 +45,8 @@ def test_it_begins_with_a_plan(planned):
     assert isinstance(begin(PROBLEM).action, Replan)
     first = head(planned)
     assert first.role == "fit" and first.repetition == 0
-    assert len(planned.queue) == sum(s.times for s in planned.stops) == planned.rounds[0].planned
-    assert sum(s.times == 2 for s in planned.stops) == 4
+    assert len(planned.queue) == sum(s.times for s in planned.configurations) == planned.rounds[0].planned
+    assert sum(s.times == 2 for s in planned.configurations) == 4
     assert planned.queue[0] == first.index and planned.left >= len(planned.queue)
 
 
@@ -58,7 +58,7 @@ def test_a_measurement_takes_its_visit_out_and_a_repetition_is_counted(planned):
         state = state.measured(action.index, action.q, POINTS[0])
     assert len(set(seen)) == len(planned.queue) and isinstance(state.action, Replan)
     assert [r for _, r in seen[-4:]] == [1, 1, 1, 1]
-    assert state.spent() == len(state.rows) == len(seen)
+    assert state.spent() == len(state.measurements) == len(seen)
 
 
 def test_failures_are_tried_again_then_given_up(planned):
@@ -75,13 +75,13 @@ def test_skipping_costs_nothing_and_is_no_failure(planned):
     action = head(planned)
     state = planned.skipped(action.index)
     assert action.index not in state.queue and state.spent() == 0 and state.given_up == 0
-    assert state.exclusions[0].asked
+    assert state.exclusions[0].requested
     assert len(planned.exclusions) == 0, "the state before is what it was"
 
 
 def test_a_stop_measured_once_and_then_unreachable_leaves_no_neighbourhood(planned):
-    twice = next(i for i, s in enumerate(planned.stops) if s.times == 2)
-    state = planned.measured(twice, planned.stops[twice].q, POINTS).unreachable(twice, "blocked")
+    twice = next(i for i, s in enumerate(planned.configurations) if s.times == 2)
+    state = planned.measured(twice, planned.configurations[twice].q, POINTS).unreachable(twice, "blocked")
     assert not state.exclusions and state.dropped == (twice,) and twice not in state.queue
 
 
@@ -89,15 +89,15 @@ def test_pause_and_resume_change_nothing_else(planned):
     paused = planned.pause()
     assert isinstance(paused.action, Paused)
     assert dataclasses.replace(paused.resume()).queue == planned.queue
-    measured = paused.measured(planned.queue[0], planned.stops[planned.queue[0]].q, POINTS)
-    assert isinstance(measured.action, Paused) and len(measured.rows) == 1
+    measured = paused.measured(planned.queue[0], planned.configurations[planned.queue[0]].q, POINTS)
+    assert isinstance(measured.action, Paused) and len(measured.measurements) == 1
 
 
 def test_an_undone_measurement_is_visited_again(planned):
     action = head(planned)
     state = planned.measured(action.index, action.q, POINTS, number=7)
     back = state.withdrawn(7, "an outlier")
-    assert not back.rows and back.queue.count(action.index) == planned.queue.count(action.index)
+    assert not back.measurements and back.queue.count(action.index) == planned.queue.count(action.index)
     assert back.spent() == 1 and back.withdrawn(99, "unknown") is back
     again = back.measured(action.index, action.q, POINTS, number=8).withdrawn(8, "an outlier")
     assert action.index not in again.queue and again.given_up == 1
@@ -107,8 +107,8 @@ def test_a_measurement_heard_twice_counts_once(planned):
     action = head(planned)
     once = planned.measured(action.index, action.q, POINTS, number=3)
     twice = once.measured(action.index, action.q, POINTS + 1.0, number=3)
-    assert len(twice.rows) == 1 and twice.queue == once.queue
-    np.testing.assert_array_equal(twice.rows[0].points, POINTS + 1.0)
+    assert len(twice.measurements) == 1 and twice.queue == once.queue
+    np.testing.assert_array_equal(twice.measurements[0].points, POINTS + 1.0)
 
 
 def test_events_while_a_decision_is_made_are_kept(planned):
@@ -117,9 +117,9 @@ def test_events_while_a_decision_is_made_are_kept(planned):
     while isinstance(state.action, Measure):
         state = state.measured(state.action.index, state.action.q, world_point(state.action.q))
     decision = decide(state)
-    later = state.withdrawn(state.rows[0].number, "undone").pause().decided(decision)
-    assert later.paused and len(later.rows) == len(state.rows) - 1
-    assert set(decision.queue) <= set(later.queue) and state.rows[0].index in later.queue
+    later = state.withdrawn(state.measurements[0].number, "undone").pause().decided(decision)
+    assert later.paused and len(later.measurements) == len(state.measurements) - 1
+    assert set(decision.queue) <= set(later.queue) and state.measurements[0].index in later.queue
 
 
 def world_point(q: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ def test_everything_is_frozen(planned):
     with pytest.raises(dataclasses.FrozenInstanceError):
         planned.paused = True
     with pytest.raises(ValueError, match="read-only"):
-        planned.stops[0].q[0] = 0.0
+        planned.configurations[0].q[0] = 0.0
 
 
 # ── after a crash ────────────────────────────────────────────────────────────────────────────────────
@@ -165,9 +165,9 @@ def run_on(state: CampaignState, seed: int, stop_after: int = 10_000) -> Campaig
 def test_it_goes_on_from_its_measurements(events):
     before = run_on(begin(PROBLEM), 1, events)
     state = from_measurements(PROBLEM, before.data("fit"), before.data("validation"))
-    assert len(state.rows) == len(before.rows) and isinstance(state.action, Replan)
-    assert sorted(s.times for s in state.stops) == sorted(
-        sum(r.index == i for r in before.rows) for i in {r.index for r in before.rows}
+    assert len(state.measurements) == len(before.measurements) and isinstance(state.action, Replan)
+    assert sorted(s.times for s in state.configurations) == sorted(
+        sum(r.index == i for r in before.measurements) for i in {r.index for r in before.measurements}
     )
     after = run_on(state, 2)
     assert after.result.outcome == "reached" and after.result.accuracy <= PROBLEM.required_accuracy
@@ -205,7 +205,7 @@ def test_no_sequence_of_events_breaks_it(planned, events):
     for event in events:
         index = state.queue[0] if state.queue else 0
         if event == "measure":
-            state = state.measured(index, state.stops[index].q, POINTS, number=number)
+            state = state.measured(index, state.configurations[index].q, POINTS, number=number)
             number += 1
         elif event == "undo":
             state = state.withdrawn(number - 1, "undone")
@@ -217,7 +217,7 @@ def test_no_sequence_of_events_breaks_it(planned, events):
         gone = {e.index for e in state.exclusions} | set(state.dropped)
         assert not gone & set(state.queue)
         assert isinstance(state.action, Paused if state.paused else (Measure if state.queue else Replan))
-        assert all(state.queue.count(i) <= state.stops[i].times for i in state.queue)
+        assert all(state.queue.count(i) <= state.configurations[i].times for i in state.queue)
     assert not isinstance(state.action, (Validate, Finished))
 
 

@@ -265,7 +265,7 @@ def test_calibrated_urdf_and_kinematics(run: Run, arm: tuple[Path, Path], tmp_pa
     assert paths == (str(estimate), str(urdf), str(kinematics))
     assert {"base.x", "target_1.x", "target_2.z"} <= set(result["not_written"])
     _, err = run(*words, shown=True)
-    assert "Not in" in err and "base.*, target_1.*, target_2.*" in err
+    assert "Not written to" in err and "base.*, target_1.*, target_2.*" in err
     q = random_configurations(mixed(), 10, 9)
     real = read_estimate(estimate).calibrated(Robot.load(arm[0]))
     rotation, xyz = real.base_pose

@@ -14,7 +14,7 @@ from robots import MIXED_URDF, mixed, plan_of, random_configurations
 
 from calib_planner import Robot
 from calib_planner.cli import main
-from calib_planner.cli.sheet import FILES
+from calib_planner.io import SHEET_FILES as FILES
 from calib_planner.io import read_plan, read_plan_csv, write_plan
 from calib_planner.planning.sheet import plan_identity
 

@@ -43,7 +43,7 @@ def test_directions_are_the_null_space(name):
     scale = np.where(norms > 1e-9, norms, 1.0)
     _, values, vt = np.linalg.svd(jacobian / scale)
     rank = int(np.sum(values > 1e-6))
-    assert found.rank == rank == len(robot.parameter_names) - len(found.held)
+    assert found.rank == rank == len(robot.parameter_names) - len(found.fixed)
     assert values[rank - 1] > 1e-4  # nothing here is a matter of opinion
     np.testing.assert_allclose(jacobian @ found.directions.T, 0.0, atol=1e-12)
     null = vt[rank:] / scale
@@ -51,11 +51,11 @@ def test_directions_are_the_null_space(name):
     stack /= np.linalg.norm(stack, axis=1)[:, None]
     if len(null):
         assert np.linalg.matrix_rank(stack, tol=1e-6) == len(null)
-    assert np.linalg.matrix_rank((jacobian / scale)[:, list(found.kept)], tol=1e-6) == rank
-    for i, direction, words in zip(found.held, found.directions, found.combinations, strict=True):
+    assert np.linalg.matrix_rank((jacobian / scale)[:, list(found.free)], tol=1e-6) == rank
+    for i, direction, words in zip(found.fixed, found.directions, found.combinations, strict=True):
         assert direction[i] == 1.0
         others = [robot.parameter_names[k] for k in np.flatnonzero(direction) if k != i]
-        assert set(others) <= {robot.parameter_names[k] for k in found.kept}
+        assert set(others) <= {robot.parameter_names[k] for k in found.free}
         assert words.startswith(robot.parameter_names[i] if not others else f"1·{robot.parameter_names[i]}")
 
 
@@ -72,14 +72,14 @@ def test_priority_is_base_and_targets_then_the_request(name):
     for i in order:
         if np.linalg.matrix_rank(unit[:, [*kept, i]], tol=1e-6) > len(kept):
             kept.append(i)
-    assert analyse(jacobian, names).kept == tuple(kept)
+    assert analyse(jacobian, names).free == tuple(kept)
 
 
 def test_the_request_decides_between_two_that_are_one():
     """q1 and base.rz turn the same; without the base, the one asked for first is kept."""
     robot = Robot.load("planar_2r").with_parameters("full")
     first, second = robot.parameter_names, robot.parameter_names[::-1]
-    held = [set(np.array(names)[list(analyse(stacked(robot.with_parameters(names)), names).held)])
+    held = [set(np.array(names)[list(analyse(stacked(robot.with_parameters(names)), names).fixed)])
             for names in (first, second)]  # fmt: skip
     assert held[0] != held[1] and len(held[0]) == len(held[1]) == 2
 
@@ -95,7 +95,7 @@ def test_small_shares_are_left_out_of_the_words_only():
 
 def test_fewer_equations_than_parameters_keep_no_more_than_there_are():
     found = analyse(np.random.default_rng(0).standard_normal((3, 5)), tuple("abcde"))
-    assert found.kept == (0, 1, 2) and found.held == (3, 4)
+    assert found.free == (0, 1, 2) and found.fixed == (3, 4)
 
 
 # ── hidden by noise ──────────────────────────────────────────────────────────────────────────────────

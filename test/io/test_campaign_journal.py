@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 
 from calib_planner import FileFormatError, Robot
-from calib_planner.campaign import FIT, VALIDATION, CampaignProblem, CampaignState, Decision, begin
-from calib_planner.campaign.state import Stop
+from calib_planner.campaign import (
+    FIT,
+    VALIDATION,
+    CampaignProblem,
+    CampaignState,
+    NextStep,
+    PlannedConfiguration,
+    begin,
+)
 from calib_planner.errors import StoreError
 from calib_planner.io import Journal, begin_journal, open_journal
 from calib_planner.io.journal import FILE
@@ -25,8 +32,8 @@ POINTS = np.random.default_rng(1).normal(size=(6, 1, 3)) / 3.0
 def noted(folder: Path) -> tuple[Journal, CampaignState]:
     """Four stops for the fit, two for validation; one undone, one given up."""
     journal = begin_journal(folder, "abc", ROBOT)
-    stops = tuple(Stop(q, FIT if k < 4 else VALIDATION) for k, q in enumerate(Q))
-    state = begin(PROBLEM).decided(Decision(FIT, "", stops, (), (0, 1, 2, 3, 4, 5)))
+    stops = tuple(PlannedConfiguration(q, FIT if k < 4 else VALIDATION) for k, q in enumerate(Q))
+    state = begin(PROBLEM).decided(NextStep(FIT, "", stops, (), (0, 1, 2, 3, 4, 5)))
     events = [
         lambda s: s.measured(0, Q[0], POINTS[0], 11),
         lambda s: s.measured(1, Q[1], POINTS[1], 12),
@@ -47,23 +54,23 @@ def test_it_comes_back_to_the_bit(tmp_path: Path) -> None:
     stored = open_journal(tmp_path / "new", ROBOT)
     assert stored is not None and stored.campaign_id == "abc" and not stored.finished
     state = stored.state(PROBLEM)
-    assert [(r.number, state.stops[r.index].role) for r in state.rows] == [
+    assert [(r.number, state.configurations[r.index].role) for r in state.measurements] == [
         (11, FIT), (14, FIT), (15, VALIDATION)
     ]  # fmt: skip
-    for row, k in zip(state.rows, (0, 3, 4), strict=True):
+    for row, k in zip(state.measurements, (0, 3, 4), strict=True):
         np.testing.assert_array_equal(row.q, Q[k])
         np.testing.assert_array_equal(row.points, POINTS[k])
-    assert [(e.reason, e.asked) for e in state.exclusions] == [("a wall", False)]
+    assert [(e.reason, e.requested) for e in state.exclusions] == [("a wall", False)]
     np.testing.assert_array_equal(state.exclusions[0].q, Q[2])
 
 
 def test_a_validation_that_joined_the_fit_is_part_of_it(tmp_path: Path) -> None:
     journal, state = noted(tmp_path)
-    journal.note(state, state.decided(Decision(FIT, "", joins=True)))
+    journal.note(state, state.decided(NextStep(FIT, "", joins=True)))
     stored = open_journal(tmp_path, ROBOT)
     assert stored is not None
     again = stored.state(PROBLEM)
-    assert len(again.of_role(FIT)) == 3 and again.data(VALIDATION) is None
+    assert len(again.measurements_of(FIT)) == 3 and again.data(VALIDATION) is None
 
 
 @pytest.mark.parametrize("torn", ['{"measured": 99, "role"', '{"measured": 99}', "\x00\x00", "{"])

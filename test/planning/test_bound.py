@@ -11,7 +11,7 @@ from robots import mixed, random_configurations
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
 from calib_planner.planning import Candidates, PlanPrior, Search, plan_space
-from calib_planner.planning.bound import RelaxedProblem, maximise_sensitivity, relaxed_design
+from calib_planner.planning.bound import DesignProblem, approximate_design, maximise_sensitivity
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, square_root
@@ -70,22 +70,22 @@ def random_problem(seed: int) -> PlanProblem:
     )
 
 
-def relaxed_problem(space: PlanSpace) -> RelaxedProblem:
+def design_problem(space: PlanSpace) -> DesignProblem:
     criterion = space.criterion(space.problem.criterion)
     n = space.problem.measurements
-    return RelaxedProblem(space.single, criterion, space.prior, n, space.feasibility)
+    return DesignProblem(space.single, criterion, space.prior, n, space.feasibility)
 
 
 def proven(problem: PlanProblem, rounds: int = 60):
     """The parts of a plan with a proven bound, not yet made into one."""
     space = plan_space(problem)
-    asked = relaxed_problem(space)
+    asked = design_problem(space)
     rng = np.random.default_rng(problem.search.seed)
-    design = relaxed_design(asked, problem.test_pose_array, rng, rounds=rounds)
+    design = approximate_design(asked, problem.test_pose_array, rng, rounds=rounds)
     return space, asked, design, *prove_bound(asked, design, rng)
 
 
-def best_worth_of_random_plans(space: PlanSpace, count: int, seed: int) -> float:
+def best_of_random_plans(space: PlanSpace, count: int, seed: int) -> float:
     """Largest Ψ among random plans, every one of them regular enough to be computed."""
     m = space.problem.configurations
     information = space.model.at(space.feasibility.sample(np.random.default_rng(seed), count * m))
@@ -115,14 +115,14 @@ def test_no_plan_of_a_random_chain_beats_its_bound(block):
             space = plan_space(random_problem(seed))
         except InfeasibleError:  # nothing to identify in this draw
             continue
-        asked, tests = relaxed_problem(space), space.problem.test_pose_array
-        design = relaxed_design(asked, tests, np.random.default_rng(seed), rounds=4)
-        proof = prove_maximum(space.single, asked.criterion, design.slope, design.support)
+        asked, tests = design_problem(space), space.problem.test_pose_array
+        design = approximate_design(asked, tests, np.random.default_rng(seed), rounds=4)
+        proof = prove_maximum(space.single, asked.criterion, design.gradient, design.support)
         assert proof.status == "proven"
         assert proof.tolerance <= 1.1e-4
         ceiling = proof.ceiling(space.prior, asked.measurements) * (1 + SLACK)
-        assert design.worth <= ceiling
-        assert best_worth_of_random_plans(space, 40, seed) <= ceiling
+        assert design.value <= ceiling
+        assert best_of_random_plans(space, 40, seed) <= ceiling
         assert best_worth_of_search(space, design.support, design.weights, seed) <= ceiling
         done += 1
     assert done >= 15
@@ -140,7 +140,7 @@ def test_proven_bound_of_the_two_link_arm_is_equation_20(pair, m, degrees):
     best = (1 + abs(np.sin(q0[1]))) / m  # (20)
     assert proof.active in ((1,), ())  # at the optimum d is constant: (B) is an equality for every plan
     assert bounded.bound * best >= 1.0
-    assert bounded.bound <= max(bounded.worth, design.worth) * (1 + 3.5e-3)
+    assert bounded.bound <= max(bounded.value, design.value) * (1 + 3.5e-3)
     assert bounded.bound * best <= 1.0 + 3.5e-3
 
 
@@ -151,10 +151,10 @@ def test_equation_20_to_the_tolerance_of_the_proof():
         q0 = np.radians([0.0, degrees])
         problem = PlanProblem(robot, q0, m, noise=1.0, search=Search(general_weight=0.0))
         space = plan_space(problem)
-        asked = relaxed_problem(space)
+        asked = design_problem(space)
         angle = np.arccos((1 - abs(np.sin(q0[1]))) / np.cos(q0[1]))  # (19)
         matrix = 0.5 * m * space.model.at(np.array([[0.0, angle], [0.0, -angle]])).sum(axis=0)
-        slope = asked.criterion.supporting_slope(matrix)
+        slope = asked.criterion.supporting_gradient(matrix)
         proof = prove_maximum(space.single, asked.criterion, slope, np.array([[0.0, angle]]), tolerance=1e-8)
         ceiling = proof.ceiling(space.prior, m)
         assert 1.0 - 1e-12 <= ceiling * (1 + abs(np.sin(q0[1]))) / m <= 1.0 + 1e-7
@@ -172,7 +172,7 @@ def test_no_plan_of_the_kuka_beats_its_bound(seed):
     assert found.quality.efficiency <= 1.0 + SLACK
     assert found.quality.lower_bound <= found.quality.predicted_accuracy * (1 + SLACK)
     space = plan_space(PlanProblem(robot, q0, m))
-    assert best_worth_of_random_plans(space, 300, seed) <= found.quality.lower_bound**-2 * (1 + SLACK)
+    assert best_of_random_plans(space, 300, seed) <= found.quality.lower_bound**-2 * (1 + SLACK)
 
 
 # ── the proof itself ─────────────────────────────────────────────────────────────────────────────────
@@ -191,13 +191,13 @@ def test_proven_maximum_is_above_every_sample_and_every_polished_maximum(problem
     space, asked, _, bounded, proof = proven(problem, rounds=10)
     q = random_configurations(space.robot, 100_000, 7)
     jacobian = np.ascontiguousarray(space.robot.jacobian(q))
-    height = np.sum((jacobian @ square_root(bounded.slope)) ** 2, axis=(1, 2)) / problem.instrument.typical**2
+    height = np.sum((jacobian @ square_root(bounded.gradient)) ** 2, axis=(1, 2)) / problem.instrument.typical**2
     assert height.max() <= proof.maximum_upper
-    peaks = maximise_sensitivity(asked, bounded.slope, q[np.argsort(-height)[:40]])
+    peaks = maximise_sensitivity(asked, bounded.gradient, q[np.argsort(-height)[:40]])
     assert np.exp(-peaks.value.min()) <= proof.maximum_upper * (1 + SLACK)
-    assert proof.maximum_upper <= proof.maximum_found * (1 + 1.1e-4)
-    at_found = np.sum(space.single.at(proof.where[None])[0] * proof.slope)
-    assert at_found == pytest.approx(proof.maximum_found, rel=1e-6)
+    assert proof.maximum_upper <= proof.largest_seen * (1 + 1.1e-4)
+    at_found = np.sum(space.single.at(proof.where[None])[0] * proof.gradient)
+    assert at_found == pytest.approx(proof.largest_seen, rel=1e-6)
     low, high = space.robot.joint_limits.T
     assert ((low - 1e-9 <= proof.where) & (proof.where <= high + 1e-9)).all()
 
@@ -205,7 +205,7 @@ def test_proven_maximum_is_above_every_sample_and_every_polished_maximum(problem
 def test_joints_without_effect_are_dropped_and_the_others_kept():
     space, _, _, bounded, proof = proven(PlanProblem(Robot.load("kuka_kr270"), TEST_POSE, 4))
     assert proof.active == (1, 2, 3, 4)
-    d = polynomial(space.single, square_root(bounded.slope))
+    d = polynomial(space.single, square_root(bounded.gradient))
     assert d.allowance < 1e-6 * proof.maximum_upper
     based = Robot.load("kuka_kr270").with_parameters("lengths", ("base",))
     assert 0 in proven(PlanProblem(based, TEST_POSE, 6), rounds=2)[4].active
@@ -213,9 +213,9 @@ def test_joints_without_effect_are_dropped_and_the_others_kept():
 
 def test_polynomial_is_the_sensitivity():
     space, _, _, bounded, _ = proven(PlanProblem(mixed(), np.zeros(4), 8), rounds=2)
-    d = polynomial(space.single, square_root(bounded.slope))
+    d = polynomial(space.single, square_root(bounded.gradient))
     q = random_configurations(space.robot, 50, 1)
-    expected = np.einsum("nab,ab->n", space.single.at(q), bounded.slope)
+    expected = np.einsum("nab,ab->n", space.single.at(q), bounded.gradient)
     for row, value in zip(q, expected, strict=True):
         got = d.tensor
         for k, axis in zip(d.active, d.axes, strict=True):
@@ -263,15 +263,15 @@ def test_what_is_proven_when_time_is_up_still_holds():
     wave[0, 0, 0] = 2.0 * np.abs(wave).sum()
     exact = maximise(axes, wave, 0.0, tolerance=1e-7)
     asked = itertools.count()
-    early = maximise(axes, wave, 0.0, tolerance=1e-7, stop=lambda: next(asked) > 2)
+    early = maximise(axes, wave, 0.0, tolerance=1e-7, cancel=lambda: next(asked) > 2)
     assert early.late and not exact.late
-    assert early.upper >= exact.found
-    assert exact.upper <= exact.found * (1 + 1e-6)
+    assert early.upper >= exact.largest
+    assert exact.upper <= exact.largest * (1 + 1e-6)
     value = wave
     assert exact.where is not None
     for t, axis in zip(exact.where, axes, strict=True):
         value = np.tensordot(axis.harmonics(np.array([t]))[0], value, 1)
-    assert value == pytest.approx(exact.found, rel=1e-10)
+    assert value == pytest.approx(exact.largest, rel=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -300,7 +300,7 @@ def test_any_positive_slope_gives_a_bound(seed):
             matrix = positive()
             assert scale * criterion.exact(matrix) <= np.sum(root @ root.T * matrix) * (1 + SLACK)
         matrix = positive()
-        own = square_root(criterion.supporting_slope(matrix))
+        own = square_root(criterion.supporting_gradient(matrix))
         assert _scale(criterion, own) == pytest.approx(1.0, rel=1e-6)
 
 
@@ -311,11 +311,11 @@ def test_a_maximum_that_search_missed_is_found_and_repaired():
     """Handed a slope whose largest sensitivity is hidden from it, the proof is loose, then close again."""
     problem = PlanProblem(Robot.load("kuka_kr270"), TEST_POSE, 4)
     space = plan_space(problem)
-    asked = relaxed_problem(space)
+    asked = design_problem(space)
     rng = np.random.default_rng(0)
-    good = relaxed_design(asked, problem.test_pose_array, rng)
+    good = approximate_design(asked, problem.test_pose_array, rng)
     matrix = 4.0 * space.single.at(random_configurations(space.robot, 64, 3)).mean(axis=0)
-    wrong = dataclasses.replace(good, slope=asked.criterion.supporting_slope(matrix))
+    wrong = dataclasses.replace(good, gradient=asked.criterion.supporting_gradient(matrix))
     bounded, proof = prove_bound(asked, wrong, rng)
     assert proof.status == "proven"
     assert bounded.bound == pytest.approx(good.bound, rel=5e-3)
@@ -329,7 +329,7 @@ def test_noise_without_a_polynomial_stays_numerical_and_says_so():
     assert "isotropic" in found.quality.message
 
 
-def test_pools_are_proven_by_looking_at_every_candidate():
+def test_candidates_are_proven_by_looking_at_every_candidate():
     robot = Robot.load("kuka_kr270")
     pool = random_configurations(robot, 60, 2)
     found = plan(PlanProblem(robot, TEST_POSE, 5, candidates=Candidates(pool)), prove=True)

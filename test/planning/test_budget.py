@@ -15,7 +15,7 @@ from calib_planner.planning import (
     random_accuracies,
     split_budget,
 )
-from calib_planner.planning.planner import worth_of
+from calib_planner.planning.planner import value_of
 
 POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 
@@ -64,7 +64,7 @@ def test_accuracy_out_of_reach_is_said():
 
 def test_budget_prefers_few_configurations():
     """Table 2's lesson: 12 measurements are as good from 3 or 4 configurations as from 12."""
-    found = split_budget(problem(starts=24), 12)
+    found = split_budget(problem(search=Search(starts=24)), 12)
     assert {(len(p.configurations), int(p.repetitions[0])) for p in found.tried} == {
         (3, 4), (4, 3), (6, 2), (12, 1)
     }  # fmt: skip
@@ -88,15 +88,15 @@ def test_only_criteria_in_metres():
 
 
 def test_value_of_given_configurations_is_the_plans(planned):
-    assert worth_of(problem(), planned.configurations) == pytest.approx(planned.quality.value, rel=1e-6)
+    assert value_of(problem(), planned.configurations) == pytest.approx(planned.quality.value, rel=1e-6)
 
 
 def test_repetition_is_as_good_as_measuring_again(planned):
     """r repetitions with σ_c = 0 divide the variance by r; with σ_c they cannot go below it."""
     q = planned.configurations
-    once = worth_of(problem(), q)
-    assert worth_of(problem(repetitions=9), q) == pytest.approx(once / 3, rel=1e-9)
-    rough = worth_of(problem(repeatability=3e-5, repetitions=10_000), q)
+    once = value_of(problem(), q)
+    assert value_of(problem(repetitions=9), q) == pytest.approx(once / 3, rel=1e-9)
+    rough = value_of(problem(repeatability=3e-5, repetitions=10_000), q)
     assert rough == pytest.approx(once, rel=1e-3)
 
 
@@ -132,7 +132,7 @@ def test_prior_and_measured_replace_measurements(planned):
     assert more.quality.value < planned.quality.value
     assert more.quality.lower_bound <= more.quality.value
     rows = np.concatenate([planned.configurations, more.configurations])
-    assert more.quality.value == pytest.approx(worth_of(problem(configurations=5), rows), rel=1e-6)
+    assert more.quality.value == pytest.approx(value_of(problem(configurations=5), rows), rel=1e-6)
     known = plan(problem(prior=PlanPrior({name: 1e-9 for name in robot.parameter_names if name != "q1"})))
     assert known.quality.value < planned.quality.value
 

@@ -46,9 +46,9 @@ def case(request):
 
 def test_slope_against_central_differences(case):
     matrices, h = random_matrices(4), 1e-6
-    worth, slope = case.worth_and_slope(matrices)
+    worth, slope = case.value_and_gradient(matrices)
     direction = random_matrices(4, 9) - random_matrices(4, 8)
-    up, down = (case.worth_and_slope(matrices + s * h * direction)[0] for s in (1, -1))
+    up, down = (case.value_and_gradient(matrices + s * h * direction)[0] for s in (1, -1))
     np.testing.assert_allclose((slope * direction).sum(axis=(1, 2)), (up - down) / (2 * h), rtol=2e-6)
     assert (worth > 0).all()
 
@@ -58,7 +58,7 @@ def test_homogeneous(case):
     if not case.concave:
         pytest.skip("O2 and O4 are not information functions")
     np.testing.assert_allclose(
-        case.worth_and_slope(7.0 * matrices)[0], 7.0 * case.worth_and_slope(matrices)[0], rtol=1e-10
+        case.value_and_gradient(7.0 * matrices)[0], 7.0 * case.value_and_gradient(matrices)[0], rtol=1e-10
     )
 
 
@@ -66,11 +66,11 @@ def test_supporting_hyperplane_is_above_everywhere(case):
     """(B): Ψ(M*) ≤ tr(G M*), the inequality all bounds rest on, with the exact criterion."""
     if not case.concave:
         with pytest.raises(NotImplementedError):
-            case.supporting_slope(random_matrices(1)[0])
+            case.supporting_gradient(random_matrices(1)[0])
         return
     matrices = random_matrices(60, 5)
     for at in random_matrices(8, 6):
-        slope = case.supporting_slope(at)
+        slope = case.supporting_gradient(at)
         for matrix in matrices:
             assert case.exact(matrix) <= np.sum(slope * matrix) * (1 + 1e-9)
 
@@ -102,10 +102,10 @@ def test_units_of_parameters():
         plain = make_criterion(name, SIZE, accuracy_weights(jacobians), [1, 1])
         other = make_criterion(name, SIZE, accuracy_weights(jacobians / scale), [1, 1])
         np.testing.assert_allclose(
-            plain.worth_and_slope(matrices)[0], other.worth_and_slope(scaled)[0], rtol=1e-8
+            plain.value_and_gradient(matrices)[0], other.value_and_gradient(scaled)[0], rtol=1e-8
         )
     for name in ("d", "d_star", "o1"):
-        ratio = criterion(name).worth_and_slope(scaled)[0] / criterion(name).worth_and_slope(matrices)[0]
+        ratio = criterion(name).value_and_gradient(scaled)[0] / criterion(name).value_and_gradient(matrices)[0]
         np.testing.assert_allclose(ratio, ratio[0], rtol=1e-8)
 
 

@@ -39,7 +39,7 @@ def request(
 def dense(problem: PredictionProblem, rows: list[int]) -> float:
     """Eq. (3) from full matrices: the gain of the estimator and the joint covariance of all errors."""
     robot, process = problem.robot, problem.discrepancy
-    q = np.concatenate([problem.pool[rows], problem.test_poses])
+    q = np.concatenate([problem.candidates[rows], problem.test_poses])
     n, k = len(rows), 3 * len(robot.targets)
     columns, rho = process.joint_columns(robot, q), process.correlation(robot, q, q)
     joint = np.einsum("iaj,jik,kbj->iakb", columns, rho, columns)
@@ -82,7 +82,7 @@ def test_expected_error_against_simulation() -> None:
     problem = request(mixed(), 3)
     robot, process, rng = problem.robot, problem.discrepancy, np.random.default_rng(0)
     rows = [0, 4, 8]
-    q = np.concatenate([problem.pool[rows], problem.test_poses])
+    q = np.concatenate([problem.candidates[rows], problem.test_poses])
     columns, rho = process.joint_columns(robot, q), process.correlation(robot, q, q)
     draws = 20_000
     shape = np.stack([np.linalg.cholesky(r + 1e-10 * np.eye(len(q))) for r in rho])
@@ -107,8 +107,8 @@ def test_choice_against_every_subset() -> None:
     model = PredictionModel(problem)
     best = min(model.error(list(c)) for c in combinations(range(10), 3))
     found = choose_for_prediction(problem, passes=5)
-    assert np.exp(-found.log_worth) == pytest.approx(model.error(found.rows.tolist()), rel=1e-9)
-    assert best * (1 - 1e-9) <= np.exp(-found.log_worth) <= 1.1 * best
+    assert np.exp(-found.log_value) == pytest.approx(model.error(found.rows.tolist()), rel=1e-9)
+    assert best * (1 - 1e-9) <= np.exp(-found.log_value) <= 1.1 * best
     assert len(set(found.rows.tolist())) == 3
 
 
@@ -128,11 +128,11 @@ def test_a_shared_joint_angle_is_worth_less() -> None:
 
 def test_measured_configurations_count() -> None:
     problem = request(mixed(), 3)
-    vars(problem)["measured"] = problem.pool[:2]
+    vars(problem)["measured"] = problem.candidates[:2]
     model = PredictionModel(problem)
-    twelve = len(problem.pool)
+    twelve = len(problem.candidates)
     assert model.error([twelve, twelve + 1]) == pytest.approx(model.error([0, 1]))
-    assert np.exp(-choose_for_prediction(problem).log_worth) < model.error([0, 1])
+    assert np.exp(-choose_for_prediction(problem).log_value) < model.error([0, 1])
 
 
 def test_through_the_planner() -> None:
@@ -165,7 +165,7 @@ def test_bad_values() -> None:
     with pytest.raises(InputError, match="point_sigma"):
         ModelDiscrepancy(point_sigma=-1.0)
     problem = request(mixed(), 3)
-    vars(problem)["pool"] = problem.pool[:2]
+    vars(problem)["pool"] = problem.candidates[:2]
     with pytest.raises(InfeasibleError, match="2 feasible rows"):
         choose_for_prediction(problem)
 
@@ -177,4 +177,4 @@ def test_all_placement_parameters_of_a_measured_robot() -> None:
     model = PredictionModel(problem)
     found = choose_for_prediction(problem)
     chance = [model.error(np.random.default_rng(s).choice(40, 12, replace=False).tolist()) for s in range(20)]
-    assert np.exp(-found.log_worth) < min(chance)
+    assert np.exp(-found.log_value) < min(chance)

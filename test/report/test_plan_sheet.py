@@ -66,9 +66,9 @@ def test_every_visit_has_its_numbers_and_boxes(make):
     robot = make()
     sheet = plan_sheet(plan_of(robot, random_configurations(robot, 6, 2), 3), robot)
     page = Page(sheet_page(sheet))
-    assert [k for k in page.rows if k != "head"] == [f"visit{i}" for i in range(1, 7)]
+    assert [k for k in page.rows if k != "head"] == [f"stop{i}" for i in range(1, 7)]
     for i, q in enumerate(sheet.plan.configurations):
-        text = page.rows[f"visit{i + 1}"]
+        text = page.rows[f"stop{i + 1}"]
         for name, turns, value in zip(robot.joint_names, robot.joint_is_revolute, q, strict=True):
             big = f"{np.degrees(value):.3f}°" if turns else f"{1e3 * value:.3f} mm"
             assert name in text and big.replace("-", "−") in text and f"{value:.6f}".replace("-", "−") in text
@@ -90,8 +90,8 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_nothing_is_claimed_that_was_not_checked():
     rows = Page(sheet_page(kuka_sheet())).rows
-    assert all("not checked" in rows[f"visit{i}"] and "range" not in rows[f"visit{i}"] for i in range(1, 6))
-    known = Page(sheet_page(kuka_sheet((), LaserTracker(station=STATION)))).rows["visit1"]
+    assert all("not checked" in rows[f"stop{i}"] and "range" not in rows[f"stop{i}"] for i in range(1, 6))
+    known = Page(sheet_page(kuka_sheet((), LaserTracker(station=STATION)))).rows["stop1"]
     assert "not checked" in known and "range" in known and "elevation" in known and "incidence" not in known
     text = sheet_page(kuka_sheet())
     assert re.search(r"Not checked:</strong> tracker range, .*line of sight, self-collision, other objects", text)
@@ -105,7 +105,7 @@ def test_what_is_wrong_is_said_with_its_reason():
     page = Page(text)
     assert "<b>room</b>" not in text and "no &lt;b&gt;room&lt;/b&gt;" in text
     for i, (reach, q) in enumerate(zip(sheet.checks.reachable, sheet.plan.configurations, strict=True), 1):
-        row = page.rows[f"visit{i}"]
+        row = page.rows[f"stop{i}"]
         assert reach == (q[0] > sheet.plan.configurations[2, 0])
         assert ("no <b>room</b>" in row) != reach and "tracker range" in row and "incidence" in row
     assert "Not visible: visits 1, 2, 3, 4, 5." in text and "Not reachable: visit" in text

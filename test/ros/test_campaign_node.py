@@ -289,7 +289,7 @@ def test_undone_measurements_are_made_again_and_nonsense_is_refused(bench: Bench
         cell.publish(first, **others)
     cell.publish(first, number=1, status=Measurement.REJECTED_UNDONE, reason="undone")
     bench.wait(lambda: desk.now.measured == 2)
-    assert {r.number for r in desk.node.campaign.rows} == {2, 3}
+    assert {r.number for r in desk.node.campaign.measurements} == {2, 3}
     cell.number = 200
     assert desk.call("pause")[0] and desk.call("resume")[0]
     done = desk.until(S.DONE)
@@ -306,7 +306,7 @@ def test_it_goes_on_from_its_journal(bench: Bench, cell: FakeCell, tmp_path: Pat
     assert desk.call("start")[0]
     before = desk.until(S.MEASURING, measured=5)
     bench.wait(lambda: len(cell.visited) == 6)
-    rows = desk.node.campaign.rows
+    rows = desk.node.campaign.measurements
     for step in ("deactivate", "cleanup"):
         getattr(desk.node, f"trigger_{step}")()
     with (tmp_path / FILE).open("a") as file:
@@ -315,7 +315,7 @@ def test_it_goes_on_from_its_journal(bench: Bench, cell: FakeCell, tmp_path: Pat
     desk.node.trigger_activate()
     again = desk.until(S.PAUSED, measured=5)
     assert again.campaign_id == before.campaign_id and "call ~/resume" in again.reason
-    restored = desk.node.campaign.rows
+    restored = desk.node.campaign.measurements
     assert [r.number for r in restored] == [r.number for r in rows]
     for one, other in zip(restored, rows, strict=True):
         np.testing.assert_array_equal(one.points, other.points)

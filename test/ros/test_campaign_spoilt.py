@@ -82,7 +82,7 @@ def test_what_the_identifier_withdraws_is_measured_again(bench: Bench, cell: Fak
     cell.number = 200
     assert desk.call("pause")[0] and desk.call("resume")[0]
     assert desk.until(S.DONE, 60.0).outcome == S.OUTCOME_REACHED
-    again = [r.number for r in desk.node.campaign.rows if np.abs(r.q - first).max() < 1e-9]
+    again = [r.number for r in desk.node.campaign.measurements if np.abs(r.q - first).max() < 1e-9]
     assert again and 1 not in again
 
 

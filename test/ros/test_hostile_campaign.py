@@ -77,7 +77,7 @@ class Attack:
         usual = {
             "id": 10**6,
             "plan_id": plan.plan_id,
-            "configuration_index": self.node._measuring._plan.stops.index(visit.action.index),
+            "configuration_index": self.node._measuring._plan.numbers.index(visit.action.index),
             "joint_names": ["q1", "q2"],
             "joint_positions": visit.action.q.tolist(),
             "points": [point],
@@ -107,7 +107,9 @@ class Attack:
         ok, text = self.desk.call("start")
         assert not ok and "not finished" in text
         state = self.node.campaign
-        assert self.node.is_active and len(state.rows) == 3 and not state.exclusions and not state.failures
+        assert (
+            self.node.is_active and len(state.measurements) == 3 and not state.exclusions and not state.failures
+        )
         self.bench.wait(lambda: (self.desk.now.state, self.desk.now.measured) == (S.MEASURING, 3))
         assert len(self.desk.now.reason) <= 1000
         assert [p.name for p in self.outside.iterdir()] == ["secret.txt"]

@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from markdown import MADE, code, escaped, joined, table
 
 from calib_planner import errors
+from calib_planner.campaign import OUTCOMES
+from calib_planner.campaign import RULES as CAMPAIGN
 from calib_planner.cli import CLOSED_PIPE, DONE, FAILED, INTERRUPTED, WRONG_USAGE
 from calib_planner.compensation import STATUS as COMPENSATION
 from calib_planner.identification import RULES, Rule
@@ -23,6 +25,9 @@ from calib_planner.planning import STATUS as PLAN
 INTRODUCTION = """\
 Programs should look at these words; the messages beside them are for people. Those of ROS 2 interfaces are
 constants in the [interfaces](interfaces.md)."""
+
+CAMPAIGN_VERDICT = """\
+It has the reasons of its estimate and these; without an estimate its only reason is the outcome."""
 
 EXIT = {
     DONE: "done",
@@ -47,7 +52,12 @@ def page() -> str:
     ):
         lines += [f"## {title}", "", *_statuses(status)]
     lines += ["## Verdict of an estimate", "", _sentence(inspect.getmodule(Rule)), ""]
-    lines += table(("code", "level", "found", "advice"), reasons(RULES.values()))
+    lines += table(("code", "level", "text", "advice"), reasons(RULES.values()))
+    lines += ["## Outcome of a campaign", "", *_statuses(OUTCOMES)]
+    lines += ["## Verdict of a campaign", "", CAMPAIGN_VERDICT, ""]
+    lines += table(
+        ("code", "level", "text", "advice"), reasons(r for k, r in CAMPAIGN.items() if k not in OUTCOMES)
+    )
     exits = [(str(status), words) for status, words in EXIT.items()]
     lines += ["## Exit status of `calib-planner`", "", *table(("status", "meaning"), exits)]
     lines += ["## Errors of the library", "", "All are children of `CalibPlannerError`.", ""]

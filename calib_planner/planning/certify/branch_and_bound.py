@@ -33,14 +33,14 @@ class Maximum:
 
     Attributes:
         upper: The polynomial is nowhere larger, but for the rounding of its coefficients.
-        found: Largest value met, or known before.
-        where: (k,) place of ``found``; ``None`` if it was known before.
+        largest: Largest value met, or known before.
+        where: (k,) place of ``largest``; ``None`` if it was known before.
         boxes: Boxes bounded.
         late: Whether time was up before the tolerance was reached.
     """
 
     upper: float
-    found: float
+    largest: float
     where: FloatArray | None
     boxes: int
     late: bool
@@ -53,7 +53,7 @@ def maximise(
     *,
     tolerance: float,
     time_limit: float = float("inf"),
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
 ) -> Maximum:
     """Bound the maximum from above and below.
 
@@ -61,18 +61,18 @@ def maximise(
         axes: The k axes of the box.
         tensor: Coefficients of the harmonics, one axis each; the polynomial is ≥ 0.
         known: A value that the polynomial takes somewhere on the box, or zero.
-        tolerance: How close ``upper`` shall come to ``found``, relative.
+        tolerance: How close ``upper`` shall come to ``largest``, relative.
         time_limit: Seconds; what has been proven by then is returned.
-        stop: Asked now and then; ``True`` ends the work as the time limit does.
+        cancel: Called now and then; ``True`` ends the work as the time limit does.
     """
     deadline = time.perf_counter() + time_limit
-    search = _Search(axes, tensor, known, lambda: time.perf_counter() > deadline or stop())
+    search = _Search(axes, tensor, known, lambda: time.perf_counter() > deadline or cancel())
     upper = np.inf
     for step in (*(c for c in COARSE if c > tolerance), tolerance):
         upper = min(upper, search.run(step))
         if search.late:
             break
-    return Maximum(upper, search.found, search.where, search.boxes, search.late)
+    return Maximum(upper, search.largest, search.where, search.boxes, search.late)
 
 
 @dataclass(eq=False)
@@ -98,7 +98,7 @@ class _Search:
         self, axes: tuple[Axis, ...], tensor: FloatArray, known: float, out_of_time: Callable[[], bool]
     ) -> None:
         self.axes, self.tensor, self.out_of_time = axes, tensor, out_of_time
-        self.found = known
+        self.largest = known
         self.where: FloatArray | None = None
         self.boxes, self.late = 0, False
         self.rows = max(CHUNK // max(tensor.size, 1), 1)
@@ -114,7 +114,7 @@ class _Search:
                 batch = []
         if batch:
             upper = max(upper, self._exhaust(batch, tolerance))
-        return max(upper, self.found)
+        return max(upper, self.largest)
 
     def _exhaust(self, batch: list[tuple[FloatArray, FloatArray]], tolerance: float) -> float:
         """Depth first through the halves of ``batch``; the largest upper bound of boxes that are done."""
@@ -127,7 +127,7 @@ class _Search:
             self._look_at_corners(boxes)
             self.late = self.late or self.out_of_time()
             wide = boxes.depths.max(axis=1, initial=0) < DEEPEST
-            open_ = (boxes.tops > (1.0 + tolerance) * self.found) & wide
+            open_ = (boxes.tops > (1.0 + tolerance) * self.largest) & wide
             if self.late or not self.axes:
                 open_[:] = False
             upper = max(upper, float(boxes.tops[~open_].max(initial=0.0)))
@@ -141,9 +141,9 @@ class _Search:
         ends = (slice(None), *(slice(None, None, size - 1) for size in boxes.forms.shape[1:]))
         flat = boxes.forms[ends].reshape(len(boxes.tops), -1)
         row, corner = np.unravel_index(int(np.argmax(flat)), flat.shape)
-        if flat[row, corner] <= self.found:
+        if flat[row, corner] <= self.largest:
             return
-        self.found = float(flat[row, corner])
+        self.largest = float(flat[row, corner])
         sides = np.array(np.unravel_index(corner, (2,) * len(self.axes)), float)
         half = np.array([a.pieces[1] for a in self.axes]) * 0.5 ** boxes.depths[row]
         self.where = boxes.centres[row] + (2.0 * sides - 1.0) * half

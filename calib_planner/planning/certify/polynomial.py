@@ -10,7 +10,7 @@ the first axis, unless the base is unknown, and the last where nothing behind it
 
 Rounding. Values of d carry errors of about eps per operation relative to ‖J‖‖S‖, ``amplification`` says how much
 larger they may be in the first boxes, halving takes weighted means and adds a few eps each; all this and the size
-of the coefficients dropped are the polynomial's ``allowance``, to be added to whatever is found.
+of the coefficients dropped are the polynomial's ``allowance``, to be added to every result.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class Polynomial:
     allowance: float
 
 
-def square_root(slope: FloatArray) -> FloatArray:
+def square_root(gradient: FloatArray) -> FloatArray:
     """S (p, r) with S Sᵀ ⪰ G: negative eigenvalues, which are rounding, are taken as zero."""
-    values, vectors = np.linalg.eigh(0.5 * (slope + slope.T))
+    values, vectors = np.linalg.eigh(0.5 * (gradient + gradient.T))
     keep = values > 0
     return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
 

@@ -1,16 +1,16 @@
 """A proof of the bound: a rigorous upper bound on the largest sensitivity, by branch and bound.
 
-By (B) of ``criteria`` a bound on every plan of n measurements follows from any slope G = S Sᵀ once an upper bound
-on max_q d(q) is certain, d(q) = tr(G I_1(q)). With isotropic noise d is a polynomial (see ``sensitivity``), and
-``branch_and_bound`` on its Bernstein form finds its largest value, with an allowance for rounding. What G may
-lack in being a slope of Ψ is allowed for as well, where the largest c with c Ψ(M) ≤ tr(G M) for all M has a
+By (B) of ``criteria`` a bound on every plan of n measurements follows from any gradient G = S Sᵀ once an upper
+bound on max_q d(q) is certain, d(q) = tr(G I_1(q)). With isotropic noise d is a polynomial (see ``polynomial``),
+and ``branch_and_bound`` on its Bernstein form finds its largest value, with an allowance for rounding. What G may
+lack in being a gradient of Ψ is allowed for as well, where the largest c with c Ψ(M) ≤ tr(G M) for all M has a
 closed form:
 
     accuracy       tr(G M) tr(A M⁻¹) ≥ ‖A^½ S‖²_*  (nuclear norm; Cauchy and Schwarz),    c = ‖A^½ S‖²_*
     determinant    tr(G M) ≥ p det(G M)^(1/p),                                           c = p det(G)^(1/p)
     smallest eigenvalue                                                                 c = tr G
 
-For the other criteria G is taken as the slope that it is up to rounding. Constraints only shrink the set of
+For the other criteria G is taken as the gradient that it is up to rounding. Constraints only shrink the set of
 plans: a bound over the joint limits holds for them too. With a laser tracker's noise d is no polynomial: its
 bound stays numerical.
 """
@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.planning.bound import RelaxedDesign, RelaxedProblem, relaxed_design
+from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, sensitivity, square_root
 from calib_planner.planning.criteria import Accuracy, Criterion, Determinant, Eliminating, PowerMean
@@ -37,14 +37,14 @@ TIME_LIMIT = 20.0
 LARGEST_GRID = 5**8
 ROUNDS = 4
 MISSED = 5e-4
-"""A maximum this much above what search had found, relative, is worth another relaxed design."""
+"""A maximum this much above what search had seen, relative, justifies another approximate design."""
 
 PROOF_STATUS = {
     "proven": "The bound is proven",
-    "time_limit": "The bound is proven, less closely than asked because time was up",
+    "time_limit": "The bound is proven, less closely than wanted because time was up",
     "noise": "The bound stays numerical: only isotropic noise makes the sensitivity a polynomial",
     "joints": "The bound stays numerical: too many joints for a proof",
-    "pool": "The bound is proven: every candidate was looked at",
+    "candidates": "The bound is proven: every candidate was looked at",
 }
 """Every status a proof can have."""
 
@@ -55,9 +55,9 @@ class Proof:
 
     Attributes:
         maximum_upper: d is nowhere larger; infinite if nothing is proven.
-        maximum_found: Largest value of d that was met.
-        where: (joints,) configuration where d is ``maximum_found`` [rad | m].
-        slope: (p, p) G = S Sᵀ as used.
+        largest_seen: Largest value of d that was met.
+        where: (joints,) configuration where d is ``largest_seen`` [rad | m].
+        gradient: (p, p) G = S Sᵀ as used.
         scale: c of the table above: c Ψ(M) ≤ tr(G M) for all M.
         boxes: Boxes bounded.
         active: Indices of the joints on which d depends.
@@ -66,9 +66,9 @@ class Proof:
     """
 
     maximum_upper: float
-    maximum_found: float
+    largest_seen: float
     where: FloatArray
-    slope: FloatArray
+    gradient: FloatArray
     scale: float
     boxes: int
     active: tuple[int, ...]
@@ -82,123 +82,126 @@ class Proof:
 
     @property
     def tolerance(self) -> float:
-        """How far ``maximum_upper`` is above ``maximum_found``, relative."""
-        return self.maximum_upper / self.maximum_found - 1.0 if self.maximum_found > 0 else float("inf")
+        """How far ``maximum_upper`` is above ``largest_seen``, relative."""
+        return self.maximum_upper / self.largest_seen - 1.0 if self.largest_seen > 0 else float("inf")
 
     def ceiling(self, prior: FloatArray, measurements: int) -> float:
         """Upper bound on Ψ of any plan of so many measurements, M_0 = ``prior`` (p, p)."""
-        known = float(np.sum(self.slope * prior)) * (1.0 + 1e-12)
+        known = float(np.sum(self.gradient * prior)) * (1.0 + 1e-12)
         return (known + measurements * self.maximum_upper) / self.scale
 
     @property
     def text(self) -> str:
         """One sentence for people."""
-        close = f" to {self.tolerance:.1g} of the sensitivity" if self.holds and self.status != "pool" else ""
+        within = self.holds and self.status != "candidates"
+        close = f" to {self.tolerance:.1g} of the sensitivity" if within else ""
         return f"{PROOF_STATUS[self.status]}{close}."
 
 
 def prove_bound(
-    problem: RelaxedProblem,
-    relaxed: RelaxedDesign,
+    problem: DesignProblem,
+    design: ApproximateDesign,
     rng: np.random.Generator,
     *,
     tolerance: float = TOLERANCE,
     time_limit: float = TIME_LIMIT,
-    stop: Callable[[], bool] = lambda: False,
-) -> tuple[RelaxedDesign, Proof]:
-    """Turn the bound of ``relaxed`` into a proven one.
+    cancel: Callable[[], bool] = lambda: False,
+) -> tuple[ApproximateDesign, Proof]:
+    """Turn the bound of ``design`` into a proven one.
 
-    A maximum of d that search had missed joins the support of the next relaxed design, so that a bound once
+    A maximum of d that search had missed joins the support of the next approximate design, so that a bound once
     refuted comes back almost as good. Constraints are put aside: the proof is over the joint limits.
 
     Returns:
         The design with the smallest proven bound, and its proof; the design unchanged if nothing is proven.
     """
-    if problem.pool is not None:
-        return relaxed, _prove_pool(problem, problem.pool, relaxed.slope)
+    if problem.candidates is not None:
+        return design, _prove_candidates(problem, problem.candidates, design.gradient)
     deadline = time.perf_counter() + time_limit
     free = replace(problem, feasibility=replace(problem.feasibility, constraints=()))
-    bounded, tried = bool(problem.feasibility.constraints), relaxed
+    bounded, tried = bool(problem.feasibility.constraints), design
     if bounded and not _obstacle(problem.model):
-        tried = relaxed_design(free, relaxed.support, rng, stop)
+        tried = approximate_design(free, design.support, rng, cancel)
     best: tuple[float, Proof] | None = None
     for _ in range(ROUNDS):
         proof = prove_maximum(
             problem.model,
             problem.criterion,
-            tried.slope,
+            tried.gradient,
             tried.support,
             tolerance=tolerance,
             time_limit=max(deadline - time.perf_counter(), 1e-3),
-            stop=stop,
+            cancel=cancel,
         )
         if not proof.holds:
-            return relaxed, proof
+            return design, proof
         ceiling = proof.ceiling(problem.prior, problem.measurements)
         if best is None or ceiling < best[0]:
             best = ceiling, proof
-        if tried.worth > relaxed.worth and not bounded:
-            relaxed = tried
+        if tried.value > design.value and not bounded:
+            design = tried
         missed = ceiling > (1.0 + MISSED + proof.tolerance) * tried.bound
-        if not missed or stop() or time.perf_counter() > deadline:
+        if not missed or cancel() or time.perf_counter() > deadline:
             break
         strong = tried.support[tried.weights > 1e-3]
-        tried = relaxed_design(free, np.concatenate([strong, proof.where[None]]), rng, stop)
+        tried = approximate_design(free, np.concatenate([strong, proof.where[None]]), rng, cancel)
     assert best is not None
-    return replace(relaxed, bound=best[0], slope=best[1].slope), best[1]
+    return replace(design, bound=best[0], gradient=best[1].gradient), best[1]
 
 
 def prove_maximum(
     model: InformationModel,
     criterion: Criterion,
-    slope: FloatArray,
+    gradient: FloatArray,
     known: FloatArray,
     *,
     tolerance: float = TOLERANCE,
     time_limit: float = TIME_LIMIT,
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
 ) -> Proof:
-    """Bound d(q) = tr(``slope`` I(q)) over the joint limits.
+    """Bound d(q) = tr(``gradient`` I(q)) over the joint limits.
 
     Args:
         model: Information of one measurement.
-        criterion: What ``slope`` is a slope of.
-        slope: (p, p) G, positive semi-definite.
+        criterion: What ``gradient`` is a gradient of.
+        gradient: (p, p) G, positive semi-definite.
         known: (K, joints) configurations within the limits where d is large, K ≥ 1.
-        tolerance: How close maximum_upper shall come to maximum_found, relative.
+        tolerance: How close maximum_upper shall come to largest_seen, relative.
         time_limit: Seconds; what has been proven by then is returned.
-        stop: Asked now and then; ``True`` ends the work as the time limit does.
+        cancel: Called now and then; ``True`` ends the work as the time limit does.
     """
     began = time.perf_counter()
-    root = square_root(slope)
+    root = square_root(gradient)
     reason = _obstacle(model)
     if reason:
         return Proof(np.inf, np.nan, known[0], root @ root.T, 1.0, 0, (), 0.0, reason)
     values, _ = sensitivity(model, root, known)
     d = polynomial(model, root)
-    found = maximise(d.axes, d.tensor, float(values.max()), tolerance=tolerance, time_limit=time_limit, stop=stop)
+    top = maximise(
+        d.axes, d.tensor, float(values.max()), tolerance=tolerance, time_limit=time_limit, cancel=cancel
+    )
     where = known[int(np.argmax(values))].copy()
-    if found.where is not None:
-        where[list(d.active)] = found.where
+    if top.where is not None:
+        where[list(d.active)] = top.where
     return Proof(
-        maximum_upper=found.upper + d.allowance,
-        maximum_found=found.found,
+        maximum_upper=top.upper + d.allowance,
+        largest_seen=top.largest,
         where=where,
-        slope=root @ root.T,
+        gradient=root @ root.T,
         scale=_scale(criterion, root),
-        boxes=found.boxes,
+        boxes=top.boxes,
         active=d.active,
         seconds=time.perf_counter() - began,
-        status="time_limit" if found.late else "proven",
+        status="time_limit" if top.late else "proven",
     )
 
 
-def _prove_pool(problem: RelaxedProblem, pool: FloatArray, slope: FloatArray) -> Proof:
-    """Over a finite pool (C, joints) with any noise: every d is computed, the bound is exact already."""
-    q = pool[problem.feasibility.mask(pool)]
-    d = np.einsum("nab,ab->n", problem.model.at(q), slope)
+def _prove_candidates(problem: DesignProblem, candidates: FloatArray, gradient: FloatArray) -> Proof:
+    """Over candidates (C, joints) with any noise: every d is computed, the bound is exact already."""
+    q = candidates[problem.feasibility.mask(candidates)]
+    d = np.einsum("nab,ab->n", problem.model.at(q), gradient)
     best = int(np.argmax(d))
-    return Proof(float(d[best]), float(d[best]), q[best], slope, 1.0, len(q), (), 0.0, "pool")
+    return Proof(float(d[best]), float(d[best]), q[best], gradient, 1.0, len(q), (), 0.0, "candidates")
 
 
 def _obstacle(model: InformationModel) -> str:

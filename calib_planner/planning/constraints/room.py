@@ -1,4 +1,7 @@
-"""What constraints on the robot's posture share: many of them cost one pass of kinematics."""
+"""Where the robot may be: a box, a floor, narrower joint limits, and whatever the user's function says.
+
+Conditions on the robot's posture share one pass of kinematics, however many they are (``PostureConstraint``).
+"""
 
 from __future__ import annotations
 
@@ -24,9 +27,6 @@ class PostureConstraint:
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
         """N postures of ``robot`` → (N,) bool."""
         raise NotImplementedError
-
-
-# ── Where the robot may be: a box, a floor, narrower joint limits, and whatever the user's function says ────
 
 
 @dataclass(frozen=True, eq=False)

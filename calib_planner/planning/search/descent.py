@@ -1,9 +1,15 @@
-"""Many bounded descents at once: projected BFGS with all starts in one batch.
+"""Local improvement of many plans at once: by gradients in a box, and by random steps where there are
+constraints.
 
-Each row of X is an independent minimisation over the same box. Coordinates that sit on a bound and would be
-pushed through it are frozen for the step (Bertsekas' ε-active set); the others follow the quasi-Newton
-direction, projected back onto the box along a backtracking Armijo search. Rows stop one by one; a row that
-has stopped costs nothing more.
+``descend`` is projected BFGS with all starts in one batch. Each row of X is an independent minimisation over
+the same box. Coordinates that sit on a bound and would be pushed through it do not move in that step
+(Bertsekas' ε-active set); the others follow the quasi-Newton direction, projected back onto the box along a
+backtracking Armijo search. Rows end one by one; a row that has ended costs nothing more.
+
+A descent that may not leave the allowed set ends where its direction points outside, although it could slide
+along the edge. In ``wander`` and ``climb`` every configuration gets trial steps of many lengths, in all joints
+or in one or two; the infeasible ones are dropped, the best of the others is taken if it improves the value.
+Inside, that is slower than gradients, but it needs nothing of the constraints except yes or no.
 """
 
 from __future__ import annotations
@@ -55,7 +61,7 @@ def descend(
     iterations: int = 200,
     tolerance: float = 1e-7,
     first_step: float = 0.2,
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
     mend: Mend = lambda old, new: new,
 ) -> Descent:
     """Minimise ``objective`` from every row of ``start`` within [low, high].
@@ -68,7 +74,7 @@ def descend(
         iterations: Most iterations of any row.
         tolerance: A row ends when a step lowers its value by less than this (twice in a row).
         first_step: Length of the first step [unit of x].
-        stop: Asked before every iteration; ``True`` ends the work with what there is.
+        cancel: Called before every iteration; ``True`` ends the work with what there is.
         mend: Takes the points before and after a step, (rows, D) each, to where it may lead.
     """
     x = np.clip(start, low, high)
@@ -79,7 +85,7 @@ def descend(
     idle = np.zeros(rows, int)
     live = np.flatnonzero(np.isfinite(value))
     evaluations, done = rows, 0
-    while live.size and done < iterations and not stop():
+    while live.size and done < iterations and not cancel():
         done += 1
         g = gradient[live]
         direction = _direction(x[live], g, inverse[live], low, high)
@@ -111,10 +117,10 @@ def _direction(
     x: FloatArray, g: FloatArray, inverse: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     margin = 1e-9
-    held = ((x <= low + margin) & (g > 0)) | ((x >= high - margin) & (g < 0))
-    free_g = np.where(held, 0.0, g)
+    bound = ((x <= low + margin) & (g > 0)) | ((x >= high - margin) & (g < 0))
+    free_g = np.where(bound, 0.0, g)
     direction = -np.matmul(inverse, free_g[:, :, None])[:, :, 0]
-    direction[held] = 0.0
+    direction[bound] = 0.0
     uphill = (direction * g).sum(axis=1) >= 0
     direction[uphill] = -free_g[uphill]
     return direction
@@ -139,8 +145,8 @@ def _line_search(
         trial = mend(x[open_rows], trial)
         f, df = objective(trial)
         used += len(open_rows)
-        slope = (g[open_rows] * (trial - x[open_rows])).sum(axis=1)
-        good = np.isfinite(f) & (f <= value[open_rows] + ARMIJO * slope) & (f < value[open_rows])
+        decrease = (g[open_rows] * (trial - x[open_rows])).sum(axis=1)
+        good = np.isfinite(f) & (f <= value[open_rows] + ARMIJO * decrease) & (f < value[open_rows])
         hit = open_rows[good]
         best_x[hit], best_value[hit], best_g[hit] = trial[good], f[good], df[good]
         open_rows = open_rows[~good]
@@ -171,11 +177,7 @@ def _update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: Fl
     fresh[rows] = False
 
 
-# ── Improving by feasible random steps: what gradients cannot do along the edge of what is allowed ──────────
-# A descent that may not leave the allowed set stops where its direction points outside, although it could slide
-# along the edge. Here every configuration gets trial steps of many lengths, in all joints or in one or two; the
-# infeasible ones are dropped, the best of the others is taken if it improves the worth. Inside, that is slower
-# than gradients, but it asks nothing of the constraints except yes or no.
+# ── random feasible steps ─────────────────────────────────────────────────────────────────────────────
 
 TRIALS = 48
 """Trial steps of every configuration in a sweep."""
@@ -185,10 +187,10 @@ LONGEST, SHORTEST = 0.5, 5e-4
 
 @dataclass(frozen=True, eq=False)
 class Wandered:
-    """Configurations (size, joints) after the steps, the log of their worth, worths computed."""
+    """Configurations (size, joints) after the steps, the log of their value, values computed."""
 
     configurations: FloatArray
-    log_worth: float
+    log_value: float
     evaluations: int
 
 
@@ -218,19 +220,19 @@ def wander(
     feasibility: Feasibility,
     start: FloatArray,
     rng: np.random.Generator,
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
     *,
     sweeps: int = 40,
     gain: float = 2e-4,
 ) -> Wandered:
-    """Improve the plan ``start`` (size, joints); ends when five sweeps gain less than ``gain`` in log worth."""
+    """Improve the plan ``start`` (size, joints); ends when five sweeps gain less than ``gain`` in log value."""
     q = start.copy()
     unit = model.at(q)
     matrix = unit.sum(axis=0) + prior
-    log_worth = _log_worths(criterion, matrix[None])[0]
-    marks, evaluations = [log_worth], 0
+    log_value = _log_values(criterion, matrix[None])[0]
+    marks, evaluations = [log_value], 0
     for _ in range(sweeps):
-        if stop() or (len(marks) > 5 and marks[-1] - marks[-6] < gain):
+        if cancel() or (len(marks) > 5 and marks[-1] - marks[-6] < gain):
             break
         trial, origin = feasible_steps(feasibility, q, rng)
         trial_unit = model.at(trial)
@@ -238,16 +240,16 @@ def wander(
             mine = np.flatnonzero(origin == row)
             if not mine.size:
                 continue
-            worths = _log_worths(criterion, matrix - unit[row] + trial_unit[mine])
+            psis = _log_values(criterion, matrix - unit[row] + trial_unit[mine])
             evaluations += len(mine)
-            best = int(np.argmax(worths))
-            if worths[best] > log_worth:
-                log_worth, chosen = worths[best], mine[best]
+            best = int(np.argmax(psis))
+            if psis[best] > log_value:
+                log_value, chosen = psis[best], mine[best]
                 matrix = matrix - unit[row] + trial_unit[chosen]
                 q[row], unit[row] = trial[chosen], trial_unit[chosen]
         matrix = unit.sum(axis=0) + prior
-        marks.append(log_worth)
-    return Wandered(q, float(log_worth), evaluations)
+        marks.append(log_value)
+    return Wandered(q, float(log_value), evaluations)
 
 
 def climb(
@@ -271,9 +273,9 @@ def climb(
     return q, best
 
 
-def _log_worths(criterion: Criterion, matrices: FloatArray) -> FloatArray:
+def _log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
     diagonal = np.einsum("spp->sp", matrices)
     floor = 1e-12 * diagonal.mean(axis=1)[:, None, None] * np.eye(matrices.shape[-1])
-    worth = criterion.worth_and_slope(matrices + floor)[0]
-    usable = np.isfinite(worth) & (worth > 0)
-    return np.where(usable, np.log(np.where(usable, worth, 1.0)), -np.inf)
+    psi = criterion.value_and_gradient(matrices + floor)[0]
+    usable = np.isfinite(psi) & (psi > 0)
+    return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)

@@ -1,20 +1,25 @@
-"""Exact changes of log det M over a whole pool at once.
+"""The best plan from a finite number of candidates: greedy start, then exchange (Fedorov 1972), batched.
 
-Row blocks R_j = W^½ J_j (k, p) give the information I_j = R_jᵀ R_j. With K_j = R_j M⁻¹ R_jᵀ (k, k), the matrix
-determinant lemma says what adding candidate j is worth,
+Row blocks R_j = W^½ J_j (k, p) of the candidates give the information I_j = R_jᵀ R_j. With M the information of
+the chosen rows and G = ∂Ψ/∂M, tr(G I_j) is the gain per unit weight of candidate j: one matrix product ranks
+all candidates. A pass takes every chosen row out in turn and tries the best candidates in its place; it ends
+when no single exchange improves Ψ. Starts: the approximate design rounded, greedy from nothing, and some random
+choices; the best end wins. All cost is linear in the number of candidates.
 
-    log det(M + I_j) = log det M + log det(I + K_j),                                                      (1)
+For determinants the trial of *all* candidates is exact at the price of one product. With K_j = R_j M⁻¹ R_jᵀ (k,
+k) the matrix determinant lemma says what adding candidate j gives,
 
-for every j of the pool from one product. Taking out row i changes M⁻¹ by Woodbury's identity: with
-V = M⁻¹ R_iᵀ, S = I − K_i and X_j = R_j V,
+    log det(M + I_j) = log det M + log det(I + K_j).                                                      (1)
+
+Taking out row i changes M⁻¹ by Woodbury's identity: with V = M⁻¹ R_iᵀ, S = I − K_i and X_j = R_j V,
 
     (M − I_i)⁻¹ = M⁻¹ + V S⁻¹ Vᵀ,      K_j ← K_j + X_j S⁻¹ X_jᵀ,                                          (2)
 
-and adding does the same with S = I + K_i and a minus. So one trial exchange with *all* C candidates costs
-O(C k² p), without a factorisation per candidate (Fedorov 1972; Miller and Nguyen 1994 for k = 1).
-
-Rows are scaled by the Cholesky factor of the pool's mean information, which changes log det M by a constant;
-a ridge of ``RIDGE`` times that mean keeps M invertible while rows are out.
+and adding does the same with S = I + K_i and a minus. So one trial exchange with all C candidates costs O(C k²
+p), without a factorisation per candidate (Miller and Nguyen 1994 for k = 1). With nuisance parameters
+eliminated, log det S = log det M − log det M_nn is two of them. Rows are scaled by the Cholesky factor of the
+candidates' mean information, which changes log det M by a constant. Other criteria try a shortlist of
+first-order best.
 """
 
 from __future__ import annotations
@@ -30,15 +35,15 @@ from calib_planner.planning.criteria import Criterion, Determinant, Eliminating
 from calib_planner.robot import analyse
 
 RIDGE = 1e-9
-"""Share of the pool's information that is always added; it moves log det M by about p·RIDGE."""
+"""Share of the candidates' mean information that is always added; it moves log det M by about p·RIDGE."""
 
 
 @dataclass(frozen=True, eq=False)
-class PoolRows:
-    """Scaled rows of a pool for one determinant.
+class ScaledRows:
+    """Scaled rows of all candidates for one determinant.
 
     Attributes:
-        rows: (C, k, p) R_j in coordinates in which the pool's mean information plus prior is I.
+        rows: (C, k, p) R_j in coordinates in which the candidates' mean information plus prior is I.
         prior: (p, p) M_0 in the same coordinates, ridge included.
         offset: log det of the scaling, to be added to log det M.
     """
@@ -48,8 +53,8 @@ class PoolRows:
     offset: float
 
 
-def pool_rows(rows: FloatArray, prior: FloatArray, size: int) -> PoolRows:
-    """Scale ``rows`` (C, k, p) for plans of ``size`` rows; the pool must identify all p parameters."""
+def scaled_rows(rows: FloatArray, prior: FloatArray, size: int) -> ScaledRows:
+    """Scale ``rows`` (C, k, p) for plans of ``size`` rows; the candidates must identify all p parameters."""
     flat = rows.reshape(-1, rows.shape[2])
     mean = size * (flat.T @ flat) / len(rows) + prior
     units = np.sqrt(np.diag(mean))
@@ -58,7 +63,7 @@ def pool_rows(rows: FloatArray, prior: FloatArray, size: int) -> PoolRows:
     inner = np.linalg.solve(triangle, prior / np.outer(units, units))
     ground = np.linalg.solve(triangle, inner.T) + RIDGE * np.eye(len(prior))
     offset = 2.0 * float(np.log(np.diag(triangle)).sum() + np.log(units).sum())
-    return PoolRows(np.ascontiguousarray(scaled).reshape(rows.shape), 0.5 * (ground + ground.T), offset)
+    return ScaledRows(np.ascontiguousarray(scaled).reshape(rows.shape), 0.5 * (ground + ground.T), offset)
 
 
 class RunningDeterminant:
@@ -70,21 +75,21 @@ class RunningDeterminant:
         strained: Taking a row out left M nearly singular, which costs digits: ``reset`` soon.
     """
 
-    def __init__(self, pool: PoolRows, chosen: IntArray) -> None:
-        self.pool = pool
-        count, k, p = pool.rows.shape
-        self._columns = np.ascontiguousarray(pool.rows.transpose(2, 1, 0)).reshape(p, k * count)
+    def __init__(self, candidates: ScaledRows, chosen: IntArray) -> None:
+        self.candidates = candidates
+        count, k, p = candidates.rows.shape
+        self._columns = np.ascontiguousarray(candidates.rows.transpose(2, 1, 0)).reshape(p, k * count)
         self.reset(chosen)
 
     def reset(self, chosen: IntArray) -> None:
         """Start afresh from ``chosen``, free of accumulated rounding."""
-        own = self.pool.rows[chosen].reshape(-1, self.pool.rows.shape[2])
-        matrix = self.pool.prior + own.T @ own
+        own = self.candidates.rows[chosen].reshape(-1, self.candidates.rows.shape[2])
+        matrix = self.candidates.prior + own.T @ own
         self.inverse = np.linalg.inv(matrix)
         self.inverse = 0.5 * (self.inverse + self.inverse.T)
-        self.log_det = float(np.linalg.slogdet(matrix)[1]) + self.pool.offset
-        half = self.pool.rows @ self.inverse
-        blocks = half @ np.swapaxes(self.pool.rows, 1, 2)
+        self.log_det = float(np.linalg.slogdet(matrix)[1]) + self.candidates.offset
+        half = self.candidates.rows @ self.inverse
+        blocks = half @ np.swapaxes(self.candidates.rows, 1, 2)
         self.leverage = np.ascontiguousarray(blocks.transpose(1, 2, 0))
         self.strained = False
 
@@ -94,7 +99,7 @@ class RunningDeterminant:
 
     def change(self, row: int, sign: int) -> None:
         """Add (``sign`` = 1) or take out (−1) one row, eq. (2)."""
-        lever = self.inverse @ self.pool.rows[row].T
+        lever = self.inverse @ self.candidates.rows[row].T
         small = np.eye(lever.shape[1]) + sign * self.leverage[:, :, row]
         values, vectors = np.linalg.eigh(small)
         self.strained = self.strained or values[0] < 1e-6
@@ -118,18 +123,10 @@ def log_det_plus_identity(blocks: FloatArray) -> FloatArray:
     return np.log(np.maximum(a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e), 1e-300))
 
 
-# ── The best plan from a finite pool of candidates: greedy start, then exchange (Fedorov 1972), batched ─────
-# With M the information of the chosen rows and G = ∂Ψ/∂M, tr(G I_j) is the gain per unit weight of candidate j:
-# one matrix product ranks the whole pool. A pass takes every chosen row out in turn and tries the best
-# candidates in its place; it ends when no single exchange improves Ψ. For determinants the trial of the *whole*
-# pool is exact at the price of one product, see ``determinant``; with nuisance parameters eliminated,
-# log det S = log det M − log det M_nn is two of them. Other criteria try a shortlist of first-order best.
-#
-# Starts: the relaxed optimum rounded, greedy from nothing, and some random choices; the best end wins. All cost
-# is linear in the number of candidates.
+# ── the choice ───────────────────────────────────────────────────────────────────────────────────────
 
 SHORTLIST = 24
-"""Candidates tried exactly in place of each row, where the whole pool cannot be."""
+"""Candidates tried exactly in place of each row, where all of them cannot be."""
 RANDOM_STARTS = 4
 """Starts from random rows, besides the rounded and the greedy one."""
 MOST_PASSES = 100
@@ -137,16 +134,16 @@ MOST_PASSES = 100
 
 
 @dataclass(frozen=True, eq=False)
-class PoolProblem:
-    """Choose ``size`` rows of a pool.
+class ChoiceProblem:
+    """Choose ``size`` of the candidates.
 
     Attributes:
         rows: (C, k, p) whitened Jacobians W^½ J of each candidate; RᵀR is its information.
-        criterion: Its worth is maximised.
+        criterion: Its value is maximised.
         prior: (p, p) M_0.
         size: Number of rows.
         repeat: Whether a row may be chosen more than once.
-        weights: (C,) relaxed weights to start from, or empty.
+        weights: (C,) weights of the approximate design, to start from, or empty.
         names: p names of the parameters, for messages.
     """
 
@@ -160,42 +157,42 @@ class PoolProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class PoolResult:
-    """Chosen rows (size,), the log of their worth, exchanges tried, starts done."""
+class Choice:
+    """Chosen rows (size,), the log of their value, exchanges tried, starts done."""
 
     rows: IntArray
-    log_worth: float
+    log_value: float
     evaluations: int
     starts: int = 1
 
 
 def choose(
-    problem: PoolProblem, rng: np.random.Generator, stop: Callable[[], bool] = lambda: False
-) -> PoolResult:
+    problem: ChoiceProblem, rng: np.random.Generator, cancel: Callable[[], bool] = lambda: False
+) -> Choice:
     """Choose rows; every start is exchanged to the end, the best wins.
 
     Raises:
-        InfeasibleError: The pool cannot identify the parameters, whichever rows are chosen; names the
+        InfeasibleError: The candidates cannot identify the parameters, whichever rows are chosen; names the
             combinations of parameters that no candidate shows. Or there are fewer candidates than rows.
     """
     _check(problem)
     search: _Search = _Exact(problem) if _is_determinant(problem.criterion) else _Shortlisted(problem)
-    best: PoolResult | None = None
+    best: Choice | None = None
     count = evaluations = 0
     for start in _starts(problem, rng):
         count += 1
-        rows, tried = search.run(start, stop)
-        log_worth = _log_worth(problem, rows)
+        rows, tried = search.run(start, cancel)
+        log_value = _log_value(problem, rows)
         evaluations += tried
-        if best is None or log_worth > best.log_worth:
-            best = PoolResult(rows, log_worth, 0)
-        if stop():
+        if best is None or log_value > best.log_value:
+            best = Choice(rows, log_value, 0)
+        if cancel():
             break
     assert best is not None
-    return PoolResult(best.rows, best.log_worth, evaluations, count)
+    return Choice(best.rows, best.log_value, evaluations, count)
 
 
-def _check(problem: PoolProblem) -> None:
+def _check(problem: ChoiceProblem) -> None:
     candidates, _, p = problem.rows.shape
     if not candidates or (candidates < problem.size and not problem.repeat):
         raise InfeasibleError(
@@ -205,17 +202,17 @@ def _check(problem: PoolProblem) -> None:
     known = (vectors * np.sqrt(np.maximum(values, 0.0))).T
     stacked = np.concatenate([problem.rows.reshape(-1, p), known])
     largest = float(np.linalg.norm(stacked, axis=0).max()) or 1.0
-    found = analyse(stacked / largest, problem.names or [f"parameter_{i}" for i in range(p)])
-    if found.held:
+    identifiable = analyse(stacked / largest, problem.names or [f"parameter_{i}" for i in range(p)])
+    if identifiable.fixed:
         raise InfeasibleError(
             "candidates",
-            f"all {candidates} rows together do not identify {len(found.held)} of {p} parameters; no candidate "
-            f"shows {'; '.join(found.combinations)}. Add other candidates, ask for fewer parameters or give "
-            "prior standard deviations",
+            f"all {candidates} rows together do not identify {len(identifiable.fixed)} of {p} parameters; no "
+            f"candidate shows {'; '.join(identifiable.combinations)}. Add other candidates, ask for fewer "
+            "parameters or give prior standard deviations",
         )
 
 
-def _starts(problem: PoolProblem, rng: np.random.Generator) -> list[IntArray]:
+def _starts(problem: ChoiceProblem, rng: np.random.Generator) -> list[IntArray]:
     """Rows to begin from, to be filled up greedily where they are fewer than ``size``."""
     starts = [_rounded(problem)] if len(problem.weights) else []
     starts.append(np.empty(0, np.int64))
@@ -224,8 +221,8 @@ def _starts(problem: PoolProblem, rng: np.random.Generator) -> list[IntArray]:
     return starts
 
 
-def _rounded(problem: PoolProblem) -> IntArray:
-    """Rows whose relaxed weight asks for at least half a measurement, heaviest first."""
+def _rounded(problem: ChoiceProblem) -> IntArray:
+    """Rows whose weight in the approximate design is at least half a measurement, heaviest first."""
     shares = problem.weights * problem.size
     counts = np.floor(shares + 0.5).astype(np.int64)
     if not problem.repeat:
@@ -234,33 +231,33 @@ def _rounded(problem: PoolProblem) -> IntArray:
     return np.repeat(order, counts[order])[: problem.size]
 
 
-def _information(problem: PoolProblem, rows: IntArray) -> FloatArray:
+def _information(problem: ChoiceProblem, rows: IntArray) -> FloatArray:
     own = problem.rows[rows].reshape(-1, problem.rows.shape[2])
     return problem.prior + own.T @ own
 
 
-def _log_worth(problem: PoolProblem, rows: IntArray) -> float:
-    worth = float(_worths(problem.criterion, _information(problem, rows)[None])[0])
-    return float(np.log(worth)) if worth > 0 else -np.inf
+def _log_value(problem: ChoiceProblem, rows: IntArray) -> float:
+    psi = float(_values(problem.criterion, _information(problem, rows)[None])[0])
+    return float(np.log(psi)) if psi > 0 else -np.inf
 
 
-def _worths(criterion: Criterion, matrices: FloatArray) -> FloatArray:
-    """Ψ (S,), with so small a ridge that a singular matrix is worth little, not nothing."""
+def _values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
+    """Ψ (S,), with so small a ridge that a singular matrix has a small value, not zero."""
     diagonal = np.einsum("sii->si", matrices)
     floor = 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1])
-    worth = criterion.worth_and_slope(matrices + floor)[0]
-    return np.where(np.isfinite(worth), worth, 0.0)
+    psi = criterion.value_and_gradient(matrices + floor)[0]
+    return np.where(np.isfinite(psi), psi, 0.0)
 
 
 class _Search:
     """One start, exchanged to the end."""
 
-    def run(self, start: IntArray, stop: Callable[[], bool]) -> tuple[IntArray, int]:
+    def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         """Chosen rows, and exchanges tried."""
         raise NotImplementedError
 
 
-# ── determinants: the whole pool, exactly ────────────────────────────────────────────────────────────
+# ── determinants: all candidates, exactly ────────────────────────────────────────────────────────────
 
 
 def _is_determinant(criterion: Criterion) -> bool:
@@ -269,17 +266,17 @@ def _is_determinant(criterion: Criterion) -> bool:
 
 
 class _Exact(_Search):
-    def __init__(self, problem: PoolProblem) -> None:
+    def __init__(self, problem: ChoiceProblem) -> None:
         self.problem = problem
-        self.parts = [(1, pool_rows(problem.rows, problem.prior, problem.size))]
+        self.parts = [(1, scaled_rows(problem.rows, problem.prior, problem.size))]
         if isinstance(problem.criterion, Eliminating):
             n = np.array(problem.criterion.nuisance)
             rows, prior = np.ascontiguousarray(problem.rows[:, :, n]), problem.prior[np.ix_(n, n)]
-            self.parts.append((-1, pool_rows(rows, prior, problem.size)))
+            self.parts.append((-1, scaled_rows(rows, prior, problem.size)))
 
-    def run(self, start: IntArray, stop: Callable[[], bool]) -> tuple[IntArray, int]:
+    def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         problem, chosen = self.problem, [int(i) for i in start]
-        state = [(sign, RunningDeterminant(pool, start)) for sign, pool in self.parts]
+        state = [(sign, RunningDeterminant(candidates, start)) for sign, candidates in self.parts]
         tried = 0
         while len(chosen) < problem.size:
             chosen.append(self._best(state, chosen))
@@ -288,7 +285,7 @@ class _Exact(_Search):
             changed = 0
             self._refresh(state, chosen, strained=False)
             for position, old in enumerate(chosen):
-                if stop():
+                if cancel():
                     return np.array(chosen), tried
                 self._change(state, old, -1)
                 gains = self._gains(state, chosen[:position] + chosen[position + 1 :])
@@ -326,30 +323,30 @@ class _Exact(_Search):
 
 
 class _Shortlisted(_Search):
-    def __init__(self, problem: PoolProblem) -> None:
+    def __init__(self, problem: ChoiceProblem) -> None:
         self.problem = problem
         self.flat = problem.rows.reshape(-1, problem.rows.shape[2])
         self.average = self.flat.T @ self.flat / len(problem.rows)
 
-    def run(self, start: IntArray, stop: Callable[[], bool]) -> tuple[IntArray, int]:
+    def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         problem, rows = self.problem, self._greedy(start)
         matrix = _information(problem, rows)
-        worth = float(_worths(problem.criterion, matrix[None])[0])
+        psi = float(_values(problem.criterion, matrix[None])[0])
         tried = 1
         for _ in range(MOST_PASSES):
             improved = False
             for position in range(problem.size):
-                if stop():
+                if cancel():
                     return rows, tried
                 without = matrix - self._unit(rows[position : position + 1])[0]
-                pool = self._shortlist(matrix, rows)
-                if not pool.size:
+                candidates = self._shortlist(matrix, rows)
+                if not candidates.size:
                     continue
-                trial = _worths(problem.criterion, without + self._unit(pool))
-                tried += len(pool)
+                trial = _values(problem.criterion, without + self._unit(candidates))
+                tried += len(candidates)
                 best = int(np.argmax(trial))
-                if trial[best] > worth * (1.0 + 1e-9):
-                    rows[position], worth, improved = pool[best], float(trial[best]), True
+                if trial[best] > psi * (1.0 + 1e-9):
+                    rows[position], psi, improved = candidates[best], float(trial[best]), True
                     matrix = _information(problem, rows)
             if not improved:
                 break
@@ -361,12 +358,12 @@ class _Shortlisted(_Search):
 
     def _gains(self, matrix: FloatArray) -> FloatArray:
         """(C,) tr(G I_j)."""
-        slope = self.problem.criterion.worth_and_slope(matrix[None])[1][0]
-        gains = ((self.flat @ slope) * self.flat).sum(axis=1).reshape(len(self.problem.rows), -1).sum(axis=1)
+        gradient = self.problem.criterion.value_and_gradient(matrix[None])[1][0]
+        gains = ((self.flat @ gradient) * self.flat).sum(axis=1).reshape(len(self.problem.rows), -1).sum(axis=1)
         return np.where(np.isfinite(gains), gains, 0.0)
 
     def _greedy(self, start: IntArray) -> IntArray:
-        """Fill up with the candidate of largest first-order gain, from a small multiple of the pool's mean."""
+        """Fill up with the candidate of largest first-order gain, from a little of the candidates' mean."""
         chosen, ground = list(start), 1e-3 * self.problem.size * self.average
         while len(chosen) < self.problem.size:
             gains = self._gains(ground + _information(self.problem, np.array(chosen, np.int64)))
@@ -376,7 +373,7 @@ class _Shortlisted(_Search):
         return np.array(chosen, np.int64)
 
     def _shortlist(self, matrix: FloatArray, rows: IntArray) -> IntArray:
-        """Best first-order candidates; the matrix gets a small multiple of the pool's mean to rank by."""
+        """Best first-order candidates; the matrix gets a small multiple of the candidates' mean to rank by."""
         gains = self._gains(matrix + 1e-6 * self.problem.size * self.average)
         if not self.problem.repeat:
             gains[rows] = -np.inf

@@ -1,9 +1,9 @@
 """The best plan over continuous configurations: many descents of −log Ψ from seeded starts.
 
-Gradient. For a plan with M = M_0 + Σ I(q_i), the slope G = ∂Ψ/∂M turns into ∂Ψ/∂q_i by
+Gradient. For a plan with M = M_0 + Σ I(q_i), the gradient G = ∂Ψ/∂M turns into ∂Ψ/∂q_i by
 ``LinearisedInformation.gradient``: the whole gradient costs about as much as the value.
 
-Starts. A third draws configurations from the relaxed optimum (see ``bound``) in proportion to its weights —
+Starts. A third draws configurations from the approximate design (see ``bound``) in proportion to its weights —
 rounding it, which the descent then repairs; a third repeats a good small plan, because eq. (20) and the paper's
 Table 2 show that good plans are a few good configurations repeated; the rest is random.
 
@@ -52,11 +52,11 @@ class SearchProblem:
 
     Attributes:
         model: Information of one configuration.
-        criterion: Its worth is maximised.
+        criterion: Its value is maximised.
         prior: (p, p) M_0.
         size: Number of configurations.
         feasibility: What they have to obey besides the joint limits.
-        support: (K, joints) configurations of the relaxed optimum; K may be 0.
+        support: (K, joints) configurations of the approximate design; K may be 0.
         weights: (K,) their weights.
     """
 
@@ -71,10 +71,10 @@ class SearchProblem:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """Best configurations (size, joints), the log of their worth, and the work it took."""
+    """Best configurations (size, joints), the log of their value, and the work it took."""
 
     configurations: FloatArray
-    log_worth: float
+    log_value: float
     starts: int
     evaluations: int
 
@@ -88,10 +88,10 @@ def plan_objective(problem: SearchProblem, size: int) -> Objective:
         matrix = info.sums(size) + problem.prior
         diagonal = np.einsum("spp->sp", matrix)
         diagonal += RIDGE * diagonal.mean(axis=1, keepdims=True)
-        worth, slope = problem.criterion.worth_and_slope(matrix)
-        usable = worth > 0
-        safe = np.where(usable, worth, 1.0)
-        gradient = info.gradient(-slope / safe[:, None, None])
+        psi, by_matrix = problem.criterion.value_and_gradient(matrix)
+        usable = psi > 0
+        safe = np.where(usable, psi, 1.0)
+        gradient = info.gradient(-by_matrix / safe[:, None, None])
         return np.where(usable, -np.log(safe), np.inf), gradient.reshape(len(rows), -1)
 
     return objective
@@ -101,17 +101,17 @@ def search_chunk(
     problem: SearchProblem,
     starts: int,
     rng: np.random.Generator,
-    stop: Callable[[], bool] = lambda: False,
+    cancel: Callable[[], bool] = lambda: False,
 ) -> SearchResult:
     """One part of the work: ``starts`` descents, the best of them."""
     size = problem.size
-    rows, used = _starts(problem, starts, rng, stop)
-    rough = _descend_from(problem, size, rows, stop, 80, 1e-4)
+    rows, used = _starts(problem, starts, rng, cancel)
+    rough = _descend_from(problem, size, rows, cancel, 80, 1e-4)
     finalists = rough.x[np.argsort(rough.value)[:FINALISTS]]
-    final = _descend_from(problem, size, finalists, stop, 200, 1e-7)
+    final = _descend_from(problem, size, finalists, cancel, 200, 1e-7)
     work = used + rough.evaluations + final.evaluations
     if problem.feasibility.constraints:
-        final, more = _along_the_edge(problem, final, rng, stop)
+        final, more = _along_the_edge(problem, final, rng, cancel)
         work += more
     best = int(np.argmin(final.value))
     configurations = final.x[best].reshape(size, -1)
@@ -119,26 +119,26 @@ def search_chunk(
 
 
 def _along_the_edge(
-    problem: SearchProblem, final: Descent, rng: np.random.Generator, stop: Callable[[], bool]
+    problem: SearchProblem, final: Descent, rng: np.random.Generator, cancel: Callable[[], bool]
 ) -> tuple[Descent, int]:
     """Improve the best plan by random feasible steps and descents in turn, while that pays."""
     size, best = problem.size, int(np.argmin(final.value))
     row, value, work = final.x[best], float(final.value[best]), 0
     for _ in range(EDGE_ROUNDS):
         plan = row.reshape(size, -1)
-        moved = wander(problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, stop)
-        descended = _descend_from(problem, size, moved.configurations[None], stop, 60, 1e-6)
+        moved = wander(problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel)
+        descended = _descend_from(problem, size, moved.configurations[None], cancel, 60, 1e-6)
         work += moved.evaluations + descended.evaluations
         gained = value - float(descended.value[0])
         if gained > 0:
             row, value = descended.x[0], float(descended.value[0])
-        if gained < 1e-3 or stop():
+        if gained < 1e-3 or cancel():
             break
     return Descent(row[None], np.array([value]), final.iterations, work), work
 
 
 def _starts(
-    problem: SearchProblem, starts: int, rng: np.random.Generator, stop: Callable[[], bool]
+    problem: SearchProblem, starts: int, rng: np.random.Generator, cancel: Callable[[], bool]
 ) -> tuple[FloatArray, int]:
     """(rows, size, joints) starting plans, and plans evaluated on the way."""
     size, draw = problem.size, problem.feasibility.sample
@@ -151,7 +151,7 @@ def _starts(
     tiled = -(-starts // 3) if kernel_size < size else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
-        kernel = _descend_from(problem, kernel_size, first, stop, 80, 1e-4)
+        kernel = _descend_from(problem, kernel_size, first, cancel, 80, 1e-4)
         evaluations += kernel.evaluations
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
@@ -179,7 +179,7 @@ def _descend_from(
     problem: SearchProblem,
     size: int,
     rows: FloatArray,
-    stop: Callable[[], bool],
+    cancel: Callable[[], bool],
     iterations: int,
     tolerance: float,
 ) -> Descent:
@@ -194,7 +194,7 @@ def _descend_from(
             np.tile(high, size),
             iterations=iterations,
             tolerance=tolerance,
-            stop=stop,
+            cancel=cancel,
             mend=_mend(problem.feasibility, size),
         )
         for first in range(0, len(flat), beside)

@@ -1,12 +1,13 @@
-"""The choice from a pool that predicts best on a robot with model discrepancy: greedy, then exchange.
+"""The choice of candidates that predicts best on a robot with model discrepancy: greedy, then exchange.
 
 The expected squared prediction error of eq. (3) of ``discrepancy`` is evaluated for all candidates at once; with
 V = P⁻¹ + S of the rows chosen, adding candidate c changes XᵀX by X_cᵀX_c and
 
     S ← S + X_cᵀX_c + D_c + D_cᵀ,     D_c = Σ_l a_cl (Σ_i ρ_l(c, i) a_il)ᵀ.
 
-Parameters are scaled by their prior standard deviation and rotated onto what pool and test poses can see, so P
-is I and nothing is singular: this choice needs no identifiability analysis. Cost is linear in the candidates.
+Parameters are scaled by their prior standard deviation and rotated onto what candidates and test poses can see,
+so P is I and nothing is singular: this choice needs no identifiability analysis. Cost is linear in the
+candidates.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.problem import PlanProblem
-from calib_planner.planning.search.exchange import PoolResult
+from calib_planner.planning.search.exchange import Choice
 from calib_planner.robot import Robot
 from calib_planner.tracker import Noise
 
@@ -32,11 +33,11 @@ BLOCK = 512
 
 @dataclass(frozen=True, eq=False)
 class PredictionProblem:
-    """Choose ``size`` rows of ``pool`` after which the test poses are predicted best.
+    """Choose ``size`` rows of ``candidates`` after which the test poses are predicted best.
 
     Attributes:
         robot: Nominal, with the parameters to be identified.
-        pool: (C, joints) candidates.
+        candidates: (C, joints) candidates.
         test_poses: (K, joints) where the error counts.
         shares: (K,) weights, summing to one.
         size: Number of rows.
@@ -49,7 +50,7 @@ class PredictionProblem:
     """
 
     robot: Robot
-    pool: FloatArray
+    candidates: FloatArray
     test_poses: FloatArray
     shares: FloatArray
     size: int
@@ -61,8 +62,8 @@ class PredictionProblem:
     repeat: bool = False
 
 
-def prediction_problem(problem: PlanProblem, pool: FloatArray) -> PredictionProblem:
-    """The choice that a plan problem with ``discrepancy`` asks for, from the rows of ``pool``."""
+def prediction_problem(problem: PlanProblem, candidates: FloatArray) -> PredictionProblem:
+    """The choice that a plan problem with ``discrepancy`` asks for, from the rows of ``candidates``."""
     assert problem.discrepancy is not None
     robot = problem.robot
     std = problem.discrepancy.prior_std(robot)
@@ -71,7 +72,7 @@ def prediction_problem(problem: PlanProblem, pool: FloatArray) -> PredictionProb
     nothing = np.empty((0, len(robot.joint_names)))
     return PredictionProblem(
         robot=robot,
-        pool=pool,
+        candidates=candidates,
         test_poses=problem.test_pose_array,
         shares=problem.weight_array / problem.weight_array.sum(),
         size=problem.configurations,
@@ -85,14 +86,14 @@ def prediction_problem(problem: PlanProblem, pool: FloatArray) -> PredictionProb
 
 
 def choose_for_prediction(
-    problem: PredictionProblem, stop: Callable[[], bool] = lambda: False, passes: int = PASSES
-) -> PoolResult:
-    """Rows of the pool, and −log of the expected squared error as the worth.
+    problem: PredictionProblem, cancel: Callable[[], bool] = lambda: False, passes: int = PASSES
+) -> Choice:
+    """Rows of the candidates, and −log of the expected squared error as the value.
 
     Raises:
         InfeasibleError: Fewer candidates than rows.
     """
-    count = len(problem.pool)
+    count = len(problem.candidates)
     if not count or (count < problem.size and not problem.repeat):
         raise InfeasibleError("candidates", f"{count} feasible rows, {problem.size} different ones are needed")
     model = PredictionModel(problem)
@@ -113,7 +114,7 @@ def choose_for_prediction(
     for _ in range(passes):
         changed = False
         for position in range(problem.size):
-            if stop():
+            if cancel():
                 break
             values = errors(rows[:position] + rows[position + 1 :])
             new = int(np.argmin(values))
@@ -121,19 +122,19 @@ def choose_for_prediction(
                 rows[position], changed = new, True
         if not changed:
             break
-    return PoolResult(np.array(rows, np.int64), -float(np.log(model.error(rows + fixed))), tried)
+    return Choice(np.array(rows, np.int64), -float(np.log(model.error(rows + fixed))), tried)
 
 
 class PredictionModel:
-    """Eq. (3) for any choice of rows: the pool first, then what is measured already.
+    """Eq. (3) for any choice of rows: the candidates first, then what is measured already.
 
     Attributes:
-        size: p, parameters that pool or test poses can see.
+        size: p, parameters that candidates or test poses can see.
     """
 
     def __init__(self, problem: PredictionProblem) -> None:
         robot, process = problem.robot, problem.discrepancy
-        q = np.concatenate([problem.pool, problem.measured])
+        q = np.concatenate([problem.candidates, problem.measured])
         covariance = process.covariance(robot, q, problem.noise, problem.repetitions)
         whitener = np.linalg.inv(np.linalg.cholesky(covariance))
         jacobian, tests = self._seen(problem, q)

@@ -31,9 +31,9 @@ from std_srvs.srv import Trigger
 from calib_planner.campaign import (
     CampaignResult,
     CampaignState,
-    Decision,
     Finished,
     Measure,
+    NextStep,
     Paused,
     begin,
     decide,
@@ -74,7 +74,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         self._stop = threading.Event()
-        self._work: Future[Decision] | None = None
+        self._work: Future[NextStep] | None = None
         self._work_for = ""
         self._forget()
         super().__init__("calibration_campaign", CampaignParameters(), context, overrides)
@@ -167,7 +167,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
 
     def _start(self) -> str:
         before = self.campaign
-        if before is not None and before.result is None and before.rows:
+        if before is not None and before.result is None and before.measurements:
             raise InputError(
                 "start", "a campaign that is not finished", "none", "resume it, or clean up the node"
             )

@@ -15,7 +15,7 @@ from calib_planner.errors import InputError
 from calib_planner.io import read_constraints
 from calib_planner.planning import Feasibility, ReflectorAcceptance, TrackerElevation, TrackerRange, plan_sheet
 from calib_planner.planning.constraints import Custom
-from calib_planner.planning.sheet import check_stops, plan_identity
+from calib_planner.planning.sheet import check_visits, plan_identity
 from calib_planner.tracker import Isotropic, LaserTracker
 
 CONSTRAINTS = Path(__file__).resolve().parents[2] / "config" / "constraints.yaml"
@@ -35,7 +35,7 @@ def test_reachable_and_visible_together_are_what_a_search_allows(kuka):
             Feasibility(kuka, constraints).sample(np.random.default_rng(1), 20),
         ]
     )
-    checks = check_stops(kuka, q, constraints)
+    checks = check_visits(kuka, q, constraints)
     assert checks.visible is not None
     np.testing.assert_array_equal(checks.reachable & checks.visible, Feasibility(kuka, constraints).mask(q))
     assert checks.reachable.any() and checks.visible.any() and (checks.reachable != checks.visible).any()
@@ -54,7 +54,7 @@ def test_joint_limits_and_margins(kuka):
     q[1, 2] = kuka.joint_limits[2, 1]  # on the limit
     q[2, 2] = kuka.joint_limits[2, 1] + 0.01
     q[3, 0] = kuka.joint_limits[0, 0] + 0.02
-    checks = check_stops(kuka, q)
+    checks = check_visits(kuka, q)
     assert checks.reachable.tolist() == [True, True, False, True]
     assert checks.breaks == [(), (), ("joint limits",), ()]
     assert checks.margins[2, 2] == pytest.approx(-0.01) and checks.margins[1, 2] == 0.0
@@ -65,12 +65,12 @@ def test_joint_limits_and_margins(kuka):
 def test_nothing_is_said_about_the_view_without_a_tracker(kuka):
     q = random_configurations(kuka, 3)
     for noise in (None, Isotropic(1e-5)):
-        checks = check_stops(kuka, q, (Custom("mine", lambda q: q[:, 0] > 9),), noise)
+        checks = check_visits(kuka, q, (Custom("mine", lambda q: q[:, 0] > 9),), noise)
         assert checks.visible is None and checks.sight.station is None
         assert np.isnan(checks.sight.ranges).all() and np.isnan(checks.sight.incidences).all()
         assert checks.checked == ("joint limits", "mine") and not checks.reachable.any()
         assert {"tracker range", "reflector acceptance", "line of sight"} <= set(checks.unchecked)
-    told = check_stops(kuka, q, (), LaserTracker(station=STATION))
+    told = check_visits(kuka, q, (), LaserTracker(station=STATION))
     assert told.visible is None and np.isfinite(told.sight.ranges).all()  # seen, not judged
     assert np.isfinite(told.sight.elevations).all() and np.isnan(told.sight.incidences).all()
 
@@ -80,7 +80,7 @@ def test_sight_against_plain_geometry(make):
     robot = make().with_base(Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix(), [0.5, -1.0, 0.3])
     q = random_configurations(robot, 20, 7)
     constraints = (TrackerElevation(STATION, UP), ReflectorAcceptance(STATION, NORMAL, 0.5))
-    sight = check_stops(robot, q, constraints).sight
+    sight = check_visits(robot, q, constraints).sight
     points = robot.positions(q)
     # The normal in the frame of positions: the way from each target to one moved along it.
     ahead = robot.with_targets(robot.target_offsets + NORMAL).positions(q) - points
@@ -98,10 +98,10 @@ def test_sight_against_plain_geometry(make):
 def test_two_stations_give_no_range(kuka):
     q = random_configurations(kuka, 2)
     here, there = TrackerRange(STATION, 0, 100), LaserTracker(station=STATION + 1)
-    checks = check_stops(kuka, q, (here,), there)
+    checks = check_visits(kuka, q, (here,), there)
     assert checks.sight.station is None and np.isnan(checks.sight.ranges).all()
     assert checks.visible is not None and checks.visible.all()
-    agreed = check_stops(kuka, q, (here,), LaserTracker(station=STATION))
+    agreed = check_visits(kuka, q, (here,), LaserTracker(station=STATION))
     np.testing.assert_array_equal(agreed.sight.station, STATION)
 
 

@@ -11,9 +11,9 @@ from robots import SHARED_DATA, random_configurations
 from calib_planner import Robot
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning import Candidates, PlanProblem, Search, plan
-from calib_planner.planning.bound import relax_pool
+from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
-from calib_planner.planning.search.exchange import PoolProblem, RunningDeterminant, choose, pool_rows
+from calib_planner.planning.search.exchange import ChoiceProblem, RunningDeterminant, choose, scaled_rows
 
 P = 4
 CRITERIA = {
@@ -32,17 +32,17 @@ def pool(seed: int, count: int = 11, k: int = 3) -> np.ndarray:
     return rng.standard_normal((count, k, P)) * [1.0, 1e3, 1e-2, 5.0] * rng.uniform(0.2, 2, (count, 1, 1))
 
 
-def worths(problem: PoolProblem, choices: list[tuple[int, ...]]) -> np.ndarray:
+def worths(problem: ChoiceProblem, choices: list[tuple[int, ...]]) -> np.ndarray:
     """(N,) Ψ of every choice from its definition."""
     single = np.swapaxes(problem.rows, 1, 2) @ problem.rows
     matrices = problem.prior + single[np.array(choices)].sum(axis=1)
     scale = np.sqrt(np.einsum("npp->np", matrices))
     singular = np.linalg.cond(matrices / (scale[:, :, None] * scale[:, None, :])) > 1e12
     matrices[singular] = np.eye(P)
-    return np.where(singular, 0.0, problem.criterion.worth_and_slope(matrices)[0])
+    return np.where(singular, 0.0, problem.criterion.value_and_gradient(matrices)[0])
 
 
-def brute_force(problem: PoolProblem) -> float:
+def brute_force(problem: ChoiceProblem) -> float:
     """The best worth of all choices there are, in the form that the search maximises."""
     every = combinations_with_replacement if problem.repeat else combinations
     return float(worths(problem, list(every(range(len(problem.rows)), problem.size))).max())
@@ -52,12 +52,12 @@ def brute_force(problem: PoolProblem) -> float:
 @pytest.mark.parametrize("repeat", [False, True])
 def test_small_pools_against_every_subset(name: str, repeat: bool) -> None:
     for seed in range(6):
-        problem = PoolProblem(pool(seed), CRITERIA[name], np.zeros((P, P)), 4, repeat)
+        problem = ChoiceProblem(pool(seed), CRITERIA[name], np.zeros((P, P)), 4, repeat)
         found = choose(problem, np.random.default_rng(0))
         best = brute_force(problem)
-        assert np.exp(found.log_worth) == pytest.approx(worths(problem, [tuple(found.rows)])[0], rel=1e-6)
-        assert np.exp(found.log_worth) <= best * (1 + 1e-6)
-        assert np.exp(found.log_worth) >= best * (1 - 1e-9 if name.startswith("d ") or name == "d" else 0.97)
+        assert np.exp(found.log_value) == pytest.approx(worths(problem, [tuple(found.rows)])[0], rel=1e-6)
+        assert np.exp(found.log_value) <= best * (1 + 1e-6)
+        assert np.exp(found.log_value) >= best * (1 - 1e-9 if name.startswith("d ") or name == "d" else 0.97)
         if not repeat:
             assert len(set(found.rows.tolist())) == 4
 
@@ -66,8 +66,8 @@ def test_small_pools_against_every_subset(name: str, repeat: bool) -> None:
 @pytest.mark.parametrize("repeat", [False, True])
 def test_no_choice_beats_the_bound(name: str, repeat: bool) -> None:
     for seed in range(10):
-        problem = PoolProblem(pool(seed), CRITERIA[name], np.diag([1.0, 1.0, 1e-4, 1.0]), 3, repeat)
-        relaxed = relax_pool(problem.rows, problem.criterion, problem.prior, 3, None if repeat else 3)
+        problem = ChoiceProblem(pool(seed), CRITERIA[name], np.diag([1.0, 1.0, 1e-4, 1.0]), 3, repeat)
+        relaxed = candidate_design(problem.rows, problem.criterion, problem.prior, 3, None if repeat else 3)
         found = choose(problem, np.random.default_rng(0))
         rows = problem.rows[found.rows].reshape(-1, P)
         assert problem.criterion.exact(problem.prior + rows.T @ rows) <= relaxed.bound * (1 + 1e-9)
@@ -79,8 +79,8 @@ def test_no_choice_beats_the_bound(name: str, repeat: bool) -> None:
 def test_bound_of_distinct_rows_is_the_tighter_one() -> None:
     rows = pool(1, 12)
     rows[0] *= 30.0  # one outstanding candidate, which may be taken once
-    free = relax_pool(rows, Determinant(), np.zeros((P, P)), 6, None)
-    once = relax_pool(rows, Determinant(), np.zeros((P, P)), 6, 6)
+    free = candidate_design(rows, Determinant(), np.zeros((P, P)), 6, None)
+    once = candidate_design(rows, Determinant(), np.zeros((P, P)), 6, 6)
     assert once.bound < 0.9 * free.bound
 
 
@@ -88,7 +88,7 @@ def test_bound_of_distinct_rows_is_the_tighter_one() -> None:
 def test_running_determinant_is_the_determinant(k: int) -> None:
     rows = pool(3, 20, k)
     prior = np.diag([1.0, 2.0, 1e-4, 0.5])
-    state = RunningDeterminant(pool_rows(rows, prior, 5), np.array([1, 4, 6]))
+    state = RunningDeterminant(scaled_rows(rows, prior, 5), np.array([1, 4, 6]))
     chosen = [1, 4, 6]
     for row, sign in [(3, 1), (4, -1), (9, 1), (9, 1), (1, -1)]:
         state.change(row, sign)
@@ -102,25 +102,25 @@ def test_running_determinant_is_the_determinant(k: int) -> None:
 
 def test_exactly_determined_choice() -> None:
     rows = np.random.default_rng(5).standard_normal((12, 2, P))
-    problem = PoolProblem(rows, Determinant(), np.zeros((P, P)), 2)
-    assert np.exp(choose(problem, np.random.default_rng(0)).log_worth) == pytest.approx(brute_force(problem))
+    problem = ChoiceProblem(rows, Determinant(), np.zeros((P, P)), 2)
+    assert np.exp(choose(problem, np.random.default_rng(0)).log_value) == pytest.approx(brute_force(problem))
 
 
 @pytest.mark.parametrize("criterion", [Determinant(), Accuracy(np.eye(P))])
 def test_rank_deficient_pool_names_the_combination(criterion: Determinant | Accuracy) -> None:
     rows = pool(0)
     rows[:, :, 2] = 2.0 * rows[:, :, 1]
-    problem = PoolProblem(rows, criterion, np.zeros((P, P)), 4, names=("a", "b", "c", "d"))
+    problem = ChoiceProblem(rows, criterion, np.zeros((P, P)), 4, names=("a", "b", "c", "d"))
     with pytest.raises(InfeasibleError, match=r"1·c - 2·b") as caught:
         choose(problem, np.random.default_rng(0))
     assert caught.value.constraint == "candidates"
-    informed = PoolProblem(rows, criterion, np.diag([0.0, 0.0, 1.0, 0.0]), 4)
-    assert np.isfinite(choose(informed, np.random.default_rng(0)).log_worth)
+    informed = ChoiceProblem(rows, criterion, np.diag([0.0, 0.0, 1.0, 0.0]), 4)
+    assert np.isfinite(choose(informed, np.random.default_rng(0)).log_value)
 
 
 def test_too_few_candidates() -> None:
     with pytest.raises(InfeasibleError, match="3 feasible rows"):
-        choose(PoolProblem(pool(0, 3), Determinant(), np.zeros((P, P)), 4), np.random.default_rng(0))
+        choose(ChoiceProblem(pool(0, 3), Determinant(), np.zeros((P, P)), 4), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("criterion", ["test_pose", "worst_pose", "d", "d_star", "a", "e", "o5", "o2", "o4"])
@@ -165,4 +165,4 @@ def test_pool_that_sees_less_than_the_robot_could() -> None:
     found = plan(PlanProblem(robot, None, 12, criterion="d", candidates=Candidates(candidates)))
     assert found.quality.status == "ok"
     assert len(found.quality.unidentifiable) > 24  # a robot that moves has 24 combinations, this pool sees fewer
-    assert "held at nominal" in found.quality.message
+    assert "fixed at nominal" in found.quality.message

@@ -1,4 +1,4 @@
-"""The estimate of a campaign: is what scatters noise, which more measurements average away, or the robot itself?
+"""What the measurements of a campaign say: is the scatter noise, which averages out, or the robot?
 
 The instrument's σ is a statement. Residuals larger than it explains are either more noise than stated, or a model
 discrepancy D, which no number of measurements reduces. The difference decides whether to go on or to stop, and
@@ -11,10 +11,10 @@ is Fisher's F(ν − ν_r, ν_r) if all is noise. So there are four answers:
 
     as_stated     the residuals are what the instrument says
     noise         they are more (or far less), and repetitions scatter as much: σ is scaled to what they say
-    discrepancy   F is improbable, or the joints' errors were learnt: what is left is the robot's
+    discrepancy   F is improbable, or the joints' errors were learnt: the rest is the robot's
     open          they are more, and there are not ``ENOUGH`` repetitions to tell: measure some again
 
-``open`` is never believed on the comfortable side: its accuracy is that with the discrepancy.
+While the answer is ``open``, the accuracy is the worse one, that with the discrepancy.
 """
 
 from __future__ import annotations
@@ -65,17 +65,17 @@ class Scaled:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class Assessment:
     """What the measurements of the fit say.
 
     Attributes:
-        asked: The identification's problem.
+        problem: What was identified.
         estimate: Its answer.
         scatter: One of the four answers.
         noise: The instrument as the measurements show it.
     """
 
-    asked: IdentificationProblem
+    problem: IdentificationProblem
     estimate: Estimate
     scatter: str
     noise: Noise
@@ -101,19 +101,19 @@ class Finding:
 
     @property
     def surely(self) -> float:
-        """The part of ``floor`` that it is at least: a variance from ν residuals is known to √(2/ν)."""
+        """Lower limit of ``floor`` [m]: a variance from ν residuals is known to √(2/ν)."""
         freedom = max(self.estimate.residuals.chi_square.freedom, 1)
         return self.floor * float(np.sqrt(max(1.0 - 2.0 * np.sqrt(2.0 / freedom), 0.0)))
 
     @property
     def used(self) -> Measurements:
-        """The measurements that were believed."""
-        data = self.asked.data.without(self.estimate.points.rejected)
+        """The measurements that were not rejected."""
+        data = self.problem.data.without(self.estimate.points.rejected)
         return data.select(np.flatnonzero(data.seen.any(axis=1)))
 
     @property
     def discrepancy(self) -> ModelDiscrepancy | None:
-        """What to plan with."""
+        """The discrepancy to plan with, or ``None``."""
         if self.scatter != DISCREPANCY:
             return None
         learnt, usual = self.estimate.transmission, self.estimate.noise.for_planning()
@@ -123,51 +123,44 @@ class Finding:
         return replace(usual, **own)
 
 
-def find(problem: CampaignProblem, data: Measurements) -> Finding:
-    """Identify, and say what scatters.
+def assess(state: CampaignState) -> Assessment | None:
+    """What the measurements of the fit say; ``None`` if there are none.
 
     Raises:
         NotEnoughDataError: Too few measurements that agree.
         InputError: The points look like millimetres.
     """
-    asked = _asked(problem, data, problem.instrument)
-    found = identify(asked)
-    stated = Scaled(problem.instrument, found.noise.scaled) if found.noise.scaled > 1 else problem.instrument
-    if found.transmission is not None or _lack_of_fit(found):
-        return Finding(asked, found, DISCREPANCY, stated)
-    if found.noise.discrepancy > 0:
-        if found.noise.repeat_freedom < ENOUGH:
-            return Finding(asked, found, OPEN, stated)
-        return _rescaled(problem, data, found)
-    if found.noise.scaled > 1:
-        return _rescaled(problem, data, found)
-    if (
-        found.residuals.chi_square.freedom >= FEWEST_SPARE
-        and found.residuals.chi_square.probability > 1.0 - DOUBT
-    ):
-        return _rescaled(problem, data, found)
-    return Finding(asked, found, AS_STATED, stated)
+    data = state.data(FIT)
+    if data is None:
+        return None
+    question = _question(state.problem, data, state.problem.instrument)
+    estimate = identify(question)
+    noise, chi = estimate.noise, estimate.residuals.chi_square
+    stated = Scaled(state.problem.instrument, noise.scaled) if noise.scaled > 1 else state.problem.instrument
+    if estimate.transmission is not None or _lack_of_fit(estimate):
+        return Assessment(question, estimate, DISCREPANCY, stated)
+    if noise.discrepancy > 0 and noise.repeat_freedom < ENOUGH:
+        return Assessment(question, estimate, OPEN, stated)
+    too_small = chi.freedom >= FEWEST_SPARE and chi.probability > 1.0 - DOUBT
+    if noise.discrepancy > 0 or noise.scaled > 1 or too_small:
+        # All of the scatter is taken as noise.
+        factor = noise.scaled * float(np.sqrt(max(chi.value / max(chi.freedom, 1), 1e-12)))
+        rescaled = Scaled(state.problem.instrument, factor)
+        question = _question(state.problem, data, rescaled)
+        return Assessment(question, identify(question), NOISE, rescaled)
+    return Assessment(question, estimate, AS_STATED, stated)
 
 
-def _rescaled(problem: CampaignProblem, data: Measurements, found: Estimate) -> Finding:
-    """All of the scatter taken as noise."""
-    chi = found.residuals.chi_square
-    factor = found.noise.scaled * float(np.sqrt(max(chi.value / max(chi.freedom, 1), 1e-12)))
-    noise = Scaled(problem.instrument, factor)
-    asked = _asked(problem, data, noise)
-    return Finding(asked, identify(asked), NOISE, noise)
-
-
-def _lack_of_fit(found: Estimate) -> bool:
+def _lack_of_fit(estimate: Estimate) -> bool:
     """Whether the residuals are more than repetitions explain; see the module."""
-    levels, chi = found.noise, found.residuals.chi_square
+    levels, chi = estimate.noise, estimate.residuals.chi_square
     if not levels.repeat_freedom or not levels.repeatability > 0 or levels.discrepancy <= 0:
         return False
     in_units_of_repetitions = chi.value * (levels.measurement / levels.repeatability) ** 2
     return improbable(in_units_of_repetitions, chi.freedom, levels.repeat_freedom)
 
 
-def _asked(problem: CampaignProblem, data: Measurements, noise: Noise) -> IdentificationProblem:
+def _question(problem: CampaignProblem, data: Measurements, noise: Noise) -> IdentificationProblem:
     alike = isinstance(noise, Isotropic)
     return IdentificationProblem(
         problem.robot,
@@ -179,51 +172,46 @@ def _asked(problem: CampaignProblem, data: Measurements, noise: Noise) -> Identi
     )
 
 
-# ── What is known after a batch: enough to judge by, enough altogether, or never enough; see ``decision`` ───
+# ── Is it enough to judge by, enough altogether, or never enough? ────────────────────────────────────────────
 
 LEARNABLE = 24
 """Configurations from which on errors of the joints that could be learnt would have been."""
 
 
-def found_in(state: CampaignState) -> Finding | None:
-    data = state.data(FIT)
-    return None if data is None else find(state.problem, data)
-
-
-def outcome_of(state: CampaignState, found: Finding | None) -> tuple[str, str]:
+def outcome_of(state: CampaignState, known: Assessment | None) -> tuple[str, str]:
     """A key of ``OUTCOMES`` and why; empty: go on."""
     problem, required = state.problem, f"{length(state.problem.required_accuracy)} required"
-    if found is not None and ready(state, found) and found.accuracy <= problem.required_accuracy:
-        return "reached", f"{length(found.accuracy)} predicted, {required}"
+    if known is not None and ready(state, known) and known.accuracy <= problem.required_accuracy:
+        return "reached", f"{length(known.accuracy)} predicted, {required}"
     if state.given_up > problem.most_failures:
-        reasons = sorted({e.reason for e in state.exclusions if not e.asked})
+        reasons = sorted({e.reason for e in state.exclusions if not e.requested})
         return "unreachable", f"{state.given_up} configurations given up: {cut('; '.join(reasons), 300)}"
     if state.spent(FIT) >= problem.fit_budget:
-        now = "nothing identified" if found is None else f"{length(found.accuracy)} predicted"
+        now = "nothing identified" if known is None else f"{length(known.accuracy)} predicted"
         return (
             "budget_spent",
-            f"{now}, {required}{_forecast_text(state, found)}",
+            f"{now}, {required}{_forecast_text(state, known)}",
         )
-    if found is not None and ready(state, found) and limited(state, found):
-        text = f"{length(found.floor)} at a test pose are the robot's own, {required}"
+    if known is not None and ready(state, known) and limited(state, known):
+        text = f"{length(known.floor)} at a test pose are the robot's own, {required}"
         return "limited", text
     return "", ""
 
 
-def ready(state: CampaignState, found: Finding) -> bool:
+def ready(state: CampaignState, known: Assessment) -> bool:
     """Whether there is enough to judge by."""
-    apart = different(found.used)
-    spare = 3 * int(apart.seen.sum()) - found.estimate.observability.rank
+    apart = different(known.used)
+    spare = 3 * int(apart.seen.sum()) - known.estimate.observability.rank
     enough = len(apart) >= state.problem.minimum and spare >= FEWEST_SPARE
-    return enough and found.estimate.fit.status != "not_converged"
+    return enough and known.estimate.fit.status != "not_converged"
 
 
-def limited(state: CampaignState, found: Finding) -> bool:
+def limited(state: CampaignState, known: Assessment) -> bool:
     """Whether no number of measurements would do."""
-    if found.scatter != DISCREPANCY or found.surely <= state.problem.required_accuracy:
+    if known.scatter != DISCREPANCY or known.surely <= state.problem.required_accuracy:
         return False
     may_learn = state.problem.identification.get("joint_corrections", "auto") == "auto"
-    return not may_learn or len(different(found.used)) >= LEARNABLE
+    return not may_learn or len(different(known.used)) >= LEARNABLE
 
 
 def different(data: Measurements) -> Measurements:
@@ -231,36 +219,36 @@ def different(data: Measurements) -> Measurements:
     return data.select(np.unique(configuration_labels(data.q), return_index=True)[1])
 
 
-def forecast(found: Finding, required: float) -> float:
+def forecast(known: Assessment, required: float) -> float:
     """Measurements still needed; infinite where the floor is above what is required."""
-    floor = found.floor_per_test_pose
-    total = found.estimate.accuracy.predicted
+    floor = known.floor_per_test_pose
+    total = known.estimate.accuracy.predicted
     room = required**2 - floor**2
     if not np.isfinite(total).all() or (room <= 0).any():
         return float("inf")
-    more = len(found.used) * (np.maximum(total**2 - floor**2, 0.0) / room - 1.0)
+    more = len(known.used) * (np.maximum(total**2 - floor**2, 0.0) / room - 1.0)
     return max(float(np.ceil(more.max() - 1e-9)), 0.0) + 0.0
 
 
-def _forecast_text(state: CampaignState, found: Finding | None) -> str:
-    left = float("inf") if found is None else forecast(found, state.problem.required_accuracy)
+def _forecast_text(state: CampaignState, known: Assessment | None) -> str:
+    left = float("inf") if known is None else forecast(known, state.problem.required_accuracy)
     return f"; about {left:.0f} more measurements would do" if np.isfinite(left) and left > 0 else ""
 
 
-def round_of(state: CampaignState, found: Finding | None, planned: int, note: str) -> Round:
+def round_of(state: CampaignState, known: Assessment | None, planned: int, note: str) -> Round:
     number = len(state.rounds)
-    if found is None:
+    if known is None:
         nan = float("nan")
         return Round(number, 0, 0, float("inf"), nan, nan, "", nan, planned, note)
     return Round(
         number,
-        len(found.used),
-        len(different(found.used)),
-        found.accuracy,
-        found.floor,
-        found.noise.typical,
-        found.scatter,
-        forecast(found, state.problem.required_accuracy),
+        len(known.used),
+        len(different(known.used)),
+        known.accuracy,
+        known.floor,
+        known.noise.typical,
+        known.scatter,
+        forecast(known, state.problem.required_accuracy),
         planned,
         note,
     )
