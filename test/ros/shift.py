@@ -57,7 +57,7 @@ class Shift:
     ) -> Measurement:
         """Stand still at ``q`` with ``shake`` and ``error`` [m] on the point and its stamp ``offset`` [s] ahead.
 
-        Returns what becomes of it.
+        Returns what becomes of it; others may be seen otherwise after that.
         """
         count = len(self.measurements)
         self.stamp += NANO  # the way there: a gap, which ends a standstill
@@ -74,7 +74,7 @@ class Shift:
         self.bench.wait(lambda: self.sent == self.fed)
         self.tick(q, offset)
         self.bench.wait(lambda: len(self.measurements) > count)
-        return self.measurements[-1]
+        return self.measurements[count]
 
     @property
     def fed(self) -> int:

@@ -30,21 +30,8 @@ from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 
-IDENTIFIER = {
-    "robot": "planar_2r",
-    "plan_topic": f"{NAME}/plan",
-    "keep_measurements": True,
-    "settle": 0.05,
-    "duration": 0.1,
-}
-SIMULATOR = {
-    "robot": "planar_2r",
-    "joint_speed": 50.0,
-    "dwell": 0.35,
-    "joint_rate": 200.0,
-    "tracker_rate": 200.0,
-    "seed": 3,
-}
+IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
+SIMULATOR = {"robot": "planar_2r", "joint_speed": 50.0, "dwell": 0.7, "seed": 3}
 
 
 @pytest.fixture

@@ -111,7 +111,7 @@ class Attack:
         assert (
             self.node.is_active and len(state.measurements) == 3 and not state.exclusions and not state.failures
         )
-        assert (self.desk.now.state, self.desk.now.measured) == (S.MEASURING, 3)
+        self.bench.wait(lambda: (self.desk.now.state, self.desk.now.measured) == (S.MEASURING, 3))
         assert len(self.desk.now.reason) <= 1000
         assert [p.name for p in self.outside.iterdir()] == ["secret.txt"]
         assert {p.name for p in self.folder.iterdir()} == {"outside", "store"}

@@ -61,7 +61,7 @@ class ArmShift(Shift):
                 self.send(self.points, point_message(point, stamp, "laser"))
             self.stamp += 2 * NANO
         self.bench.wait(lambda: len(self.measurements) > count)
-        return self.measurements[-1]
+        return self.measurements[count]
 
 
 def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
@@ -79,11 +79,15 @@ def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
     for q in planned.configurations:
         assert shift.rest(q).status == Measurement.ACCEPTED
     bench.wait(lambda: shift.estimates[-1].complete)
-    bench.wait(lambda: calibrated[-1].data != ARM)
-    published = parse_urdf(calibrated[-1].data, "calibrated")
-    estimate = shift.node._campaign.newest
     q = random_configurations(robot, 5, 1)
-    assert np.allclose(published.positions(q), estimate.calibrated.positions(q), atol=1e-12)
+    wanted = shift.node._campaign.newest.calibrated.positions(q)
+
+    def published() -> bool:
+        """The description comes after the estimate."""
+        return np.allclose(parse_urdf(calibrated[-1].data, "calibrated").positions(q), wanted, atol=1e-12)
+
+    bench.wait(published)
+    assert calibrated[-1].data != ARM
     assert shift.service("save").success
     assert (tmp_path / "calibrated_p.urdf").read_text() == calibrated[-1].data
 
