@@ -32,10 +32,10 @@ Watch = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """A budget divided.
+    """Measurements divided into configurations and repetitions.
 
     Attributes:
-        plan: The plan recommended.
+        plan: The recommended plan.
         tried: All plans computed, smallest number of configurations first.
         fewest: No plan of fewer measurements can reach the wanted accuracy (0 where that is not known).
     """

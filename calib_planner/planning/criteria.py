@@ -36,7 +36,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray
 
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
-"""Names a request may use."""
+"""Names that a problem may use."""
 RIDGE = 1e-12
 """Added to the information of a plan while searching, relative to its mean diagonal, so that singular plans stay
 finite."""
@@ -68,7 +68,7 @@ def _symmetric(gradient: FloatArray) -> FloatArray:
 
 
 class _Smooth:
-    """What a differentiable criterion need not write."""
+    """Methods that all differentiable criteria share."""
 
     concave = True
 
@@ -348,7 +348,7 @@ MINIMISED = ("test_pose", "worst_pose", "a")
 
 
 def reported_value(name: str, psi: float, size: int, measurements: int) -> float:
-    """The value of the table at the top for a value Ψ."""
+    """The reported value (last column of the table at the top) for Ψ."""
     if psi <= 0:
         return float("inf") if name in MINIMISED else 0.0
     if name in ("test_pose", "worst_pose"):

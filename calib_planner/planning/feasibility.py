@@ -20,7 +20,7 @@ from calib_planner.planning.constraints.room import JointRange, PostureConstrain
 from calib_planner.robot import Posture, Robot
 
 PATIENCE = 200_000
-"""Random configurations tried before a set of constraints is called empty, or nearly so."""
+"""Random configurations tried before the constraints are said to leave nothing, or hardly anything."""
 RARE = 0.01
 """Share of feasible configurations from which on rejection alone supplies as many as are wanted."""
 WITNESSES = 20_000
@@ -32,7 +32,7 @@ class Constraint(Protocol):
 
     @property
     def name(self) -> str:
-        """How messages call it."""
+        """Its name in messages."""
         ...
 
     def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:

@@ -110,7 +110,7 @@ def value_of(problem: PlanProblem, configurations: FloatArray) -> float:
 
 
 class _Clock:
-    """Time limit, cancellation and progress in one place."""
+    """Time limit, cancellation and progress of one plan."""
 
     def __init__(self, problem: PlanProblem, size: int, callback: Callback | None) -> None:
         self.began = time.perf_counter()
@@ -239,7 +239,7 @@ def _choose(
     rng: np.random.Generator,
     clock: _Clock,
 ) -> SearchResult:
-    """From the candidates."""
+    """The best choice from the candidates."""
     problem = space.problem
     candidates = np.asarray(problem.candidate_array)
     allowed = np.flatnonzero(space.feasibility.mask(candidates))
@@ -261,7 +261,7 @@ def _choose(
 
 
 def prediction_problem(problem: PlanProblem, candidates: FloatArray) -> PredictionProblem:
-    """The choice that a plan problem with ``discrepancy`` asks for, from the rows of ``candidates``."""
+    """The choice from ``candidates`` (C, joints) [rad | m] for a plan problem with ``discrepancy``."""
     assert problem.discrepancy is not None
     robot = problem.robot
     std = problem.discrepancy.prior_std(robot)
@@ -399,7 +399,7 @@ def _blind(space: PlanSpace, hidden: FloatArray) -> bool:
 
 
 def _regular(matrix: FloatArray, hidden: FloatArray) -> FloatArray:
-    """``matrix`` made invertible where the plan is blind; what does not look there is not changed by it."""
+    """``matrix`` (p, p) made invertible where the plan is blind; criteria that need nothing there stay."""
     return matrix + float(np.trace(matrix)) * hidden @ hidden.T if hidden.size else matrix
 
 

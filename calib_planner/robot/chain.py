@@ -1,8 +1,8 @@
 """The robot: eq. (1) and (2), a serial chain of elementary transforms with named parameters.
 
 A ``Robot`` never changes. ``with_parameters``, ``with_base``, ``with_targets`` and ``with_deviations`` return
-another robot. All geometric parameters that a robot could have are in its elements from the start; those not
-named in no request are constants, and constants that are zero cost nothing (see ``program``).
+another robot. All geometric parameters that a robot could have are in its elements from the start; those that
+are not active are constants, and constants that are zero cost nothing (see ``kinematics``).
 
 Frames: positions are in the *base frame of the chain's first element*: the robot's base, or the tracker's
 frame once the base pose has been set. Order of joints: ``joint_names``. Order of parameters:

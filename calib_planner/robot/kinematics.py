@@ -230,7 +230,7 @@ class Trace:
 
 
 def trace(structure: Structure, split: int) -> Trace:
-    """All that the structure asks for, traced from a frame of its own behind the first ``split`` elements."""
+    """All that the structure wants, traced from a frame of its own behind the first ``split`` elements."""
     tracer = Tracer()
     outer = _unit_frame()
     seen = _walk(tracer, outer, structure.trunk[:split], 0)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, check_array, check_number
+from calib_planner.tracker.visibility import check_direction
 
 
 class Noise(Protocol):
@@ -77,9 +78,7 @@ class LaserTracker:
             put(self, name, check_number(name, getattr(self, name), low=0, low_open=True, unit=unit))
         put(self, "range_per_metre", check_number("range_per_metre", self.range_per_metre, low=0))
         put(self, "station", check_array("station", self.station, (3,)))
-        up = np.array(check_array("up", self.up, (3,)))
-        length = check_number("up, its length", float(np.linalg.norm(up)), low=0, low_open=True)
-        put(self, "up", check_array("up", up / length, (3,)))
+        put(self, "up", check_direction("up", self.up))
 
     def covariance(self, points: NDArray[Any]) -> NDArray[Any]:
         beam = points - np.asarray(self.station)

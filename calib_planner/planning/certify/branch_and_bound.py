@@ -92,7 +92,7 @@ class _Boxes:
 
 
 class _Search:
-    """One maximisation; ``run`` may be called again with a finer tolerance."""
+    """The state of one maximisation; ``run`` may be called again with a finer tolerance."""
 
     def __init__(
         self, axes: tuple[Axis, ...], tensor: FloatArray, known: float, out_of_time: Callable[[], bool]
@@ -137,7 +137,7 @@ class _Search:
         return upper
 
     def _look_at_corners(self, boxes: _Boxes) -> None:
-        """Corner coefficients are values."""
+        """Raise the largest known value if a corner coefficient, which is a value, exceeds it."""
         ends = (slice(None), *(slice(None, None, size - 1) for size in boxes.forms.shape[1:]))
         flat = boxes.forms[ends].reshape(len(boxes.tops), -1)
         row, corner = np.unravel_index(int(np.argmax(flat)), flat.shape)

@@ -18,7 +18,7 @@ from calib_planner.tracker import check_direction
 
 
 class PostureConstraint:
-    """A condition on where joints, tip and targets are; ``holds`` is what a child says."""
+    """A condition on where joints, tip and targets are; children define ``holds``."""
 
     def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
         """(N, joints) [rad | m] → (N,) bool."""

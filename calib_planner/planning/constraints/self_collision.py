@@ -35,7 +35,7 @@ class SelfCollision:
     name: str = "self-collision"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what Pinocchio made: a process that receives this makes its own."""
+        """The state without Pinocchio's models: a process that receives a copy builds its own."""
         return {k: v for k, v in self.__dict__.items() if k != "_models"}
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What the tracker can see: range, elevation, the reflector's cone, a clear beam. See ``instrument.sight``."""
+"""What the tracker can see: range, elevation, the reflector's cone, a clear beam. See ``tracker.visibility``."""
 
 from __future__ import annotations
 
