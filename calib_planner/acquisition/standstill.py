@@ -24,13 +24,12 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner.acquisition.clocks import ClockOffsets
+from calib_planner.acquisition.clocks import NANO, ClockOffsets
 from calib_planner.acquisition.stamps import StampOrder
 from calib_planner.arrays import FloatArray, IntArray, check_array, check_count, check_ranges, frozen, ranged
 from calib_planner.errors import InputError
 from calib_planner.units import length, milliseconds
 
-NANO = 1_000_000_000
 MOST_SAMPLES = 20_000
 """Samples of one stream that a standstill holds at most."""
 IN_A_ROW = 50

@@ -1,4 +1,15 @@
-"""The problem and the result of a campaign: which accuracy, how much may be measured, and how it ended."""
+"""The problem and the result of a campaign: which accuracy, how much may be measured, and how it ended.
+
+Where the robot could not be measured, a neighbourhood of the configuration is given up with it. Around a
+configuration q_e that failed all q with
+
+    max_l |q_l − q_el| / range_l < r
+
+are excluded from plans, l running over the joints that move a target: turning another joint would repeat the same
+failure. One failure does not tell how far away the robot can be measured, so r begins small; a failure next to an
+earlier one shows that r was too small, and its own r is twice the earlier one's. No neighbourhood reaches a
+configuration that was measured.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +30,16 @@ from calib_planner.tracker import Isotropic, Noise
 
 OPTIONS = ("loss", "prior", "discrepancy", "joint_corrections", "iterations", "starts")
 """Fields of ``IdentificationProblem`` that a campaign may set; it sets the others itself."""
+COUNTS = {
+    "budget": (1, 10_000),
+    "batch": (1, 200),
+    "validation": (0, 1000),
+    "minimum": (1, 1000),
+    "attempts": (1, 100),
+    "most_failures": (0, 10_000),
+    "seed": (0, 2**31 - 1),
+}
+"""Whole numbers of a ``CampaignProblem``: smallest and largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +49,7 @@ class CampaignProblem:
     Attributes:
         robot: The nominal robot, its active parameters being those to be identified.
         test_poses: (K, joints) where accuracy matters, at least one [rad | m].
-        required_accuracy: Largest root mean square error at a test pose that will do [m].
+        required_accuracy: Largest acceptable root mean square error at a test pose [m].
         budget: Measurements allowed in all, those of the validation and those that failed included.
         batch: Configurations planned at a time; after each batch the rest is planned anew.
         sigma: Standard deviation of one coordinate of one measurement [m]: what to expect until the
@@ -71,27 +92,21 @@ class CampaignProblem:
             length = check_number(name, getattr(self, name), low=0, low_open=True, high=1.0, unit="m")
             put(self, name, length)
         put(self, "noise", Isotropic(self.sigma) if self.noise is None else self.noise)
-        put(self, "budget", check_count("budget", self.budget, high=10_000))
-        put(self, "batch", check_count("batch", self.batch, high=200))
-        put(self, "validation", check_count("validation", self.validation, low=0, high=1000))
-        put(self, "minimum", check_count("minimum", self.minimum, high=1000))
-        put(self, "attempts", check_count("attempts", self.attempts, high=100))
-        put(self, "most_failures", check_count("most_failures", self.most_failures, low=0, high=10_000))
-        share = check_number("exclusion", self.exclusion, low=0, low_open=True, high=0.5)
-        put(self, "exclusion", share)
-        put(self, "identification", self._checked_options())
-        # The planner refuses what it cannot use, under the names that are its own and ours.
+        for name, (low, high) in COUNTS.items():
+            put(self, name, check_count(name, getattr(self, name), low=low, high=high))
+        put(self, "exclusion", check_number("exclusion", self.exclusion, low=0, low_open=True, high=0.5))
+        for name in self.identification:
+            if name not in OPTIONS:
+                raise UnknownNameError("identification", str(name), OPTIONS)
+        put(self, "identification", {"loss": "robust", **self.identification})
+        # The planner checks the fields that it shares with us, which have the same names.
         checked = PlanProblem(
             self.robot,
             self.test_poses,
             1,
             noise=self.instrument,
             constraints=self.constraints,
-            search=Search(
-                starts=self.starts,
-                seed=check_count("seed", self.seed, low=0, high=2**31 - 1),
-                time_limit=self.time_limit,
-            ),
+            search=Search(starts=self.starts, seed=self.seed, time_limit=self.time_limit),
         )
         put(self, "test_poses", checked.test_pose_array)
         put(self, "constraints", checked.constraints)
@@ -101,12 +116,6 @@ class CampaignProblem:
         middle = self.robot.joint_limits.mean(axis=1)[None]
         made_up = Measurements(self.robot.joint_names, middle, self.robot.positions(middle))
         IdentificationProblem(self.robot, made_up, **self.identification)
-
-    def _checked_options(self) -> Mapping[str, Any]:
-        for name in self.identification:
-            if name not in OPTIONS:
-                raise UnknownNameError("identification", str(name), OPTIONS)
-        return {"loss": "robust", **self.identification}
 
     @property
     def test_pose_array(self) -> FloatArray:
@@ -125,15 +134,7 @@ class CampaignProblem:
         return self.budget - self.validation
 
 
-# ── Where the robot could not be measured: a neighbourhood that plans keep out of, wider where failures gathe
-# Around a configuration q_e that failed all q with
-#
-#     max_l |q_l − q_el| / range_l < r
-#
-# are left out, l running over the joints that move a target: to turn one that does not would be the same failure
-# again. One failure says little of how far it is to where the robot can be measured, so r begins small; a failure
-# next to an earlier one says that this was too small, and its r is twice the earlier one's. Where something was
-# measured, it can be: no neighbourhood reaches there.
+# ── configurations given up ─────────────────────────────────────────────────────────────────────────
 
 WIDEST = 0.4
 """Largest half width, as a share of each joint's range."""
@@ -212,7 +213,7 @@ def radius_of(
     return max(radius, NARROWEST)
 
 
-# ── What a campaign came to: why it ended, how it went, what was identified, and whether it holds ───────────
+# ── the result ──────────────────────────────────────────────────────────────────────────────────────
 
 OUTCOMES = {
     "reached": "the predicted accuracy is what was required",

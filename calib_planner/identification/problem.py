@@ -1,4 +1,4 @@
-"""What is asked of the identification: a robot, its measurements and how they may err."""
+"""The identification problem: a robot, its measurements, how they may err, and what is known beforehand."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from calib_planner.tracker import Noise
 LOSSES = ("linear", "robust")
 AUTOMATIC = ("auto", "off")
 UNKNOWN_SIGMA = 1e-4
-"""Standard deviation of one coordinate that stands in until the residuals have told it [m]."""
+"""Standard deviation of one coordinate that is assumed until the residuals give one [m]."""
 
 
 UPDATE: Mapping[str, Any] = MappingProxyType({"starts": 0, "joint_corrections": "off", "order_check": "off"})
-"""Settings of a quick update while measurements come in: what changes no parameter is left to the end."""
+"""Settings of a quick update while measurements come in: checks that change no parameter are left to the end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +41,16 @@ class IdentificationProblem:
             estimated from repetitions or residuals.
         loss: ``linear``: every point counts; ``robust``: points beyond the χ² gate are rejected and listed.
         test_poses: (K, joints) where the predicted accuracy is wanted, or ``None``.
-        iterations: Most iterations.
+        iterations: Largest number of iterations.
         prior: What is known of the parameters beforehand, or ``None``.
         instrument: The tracker's noise by direction, in the frame of the points; ``None``: see ``sigma``.
         discrepancy: ``auto``: residuals that measurement noise does not explain are a model discrepancy, which
             is estimated, weighs the points and adds to every predicted accuracy; ``off``: they are not.
-        joint_corrections: ``auto``: if the residuals know where the robot stood, errors of the joints'
+        joint_corrections: ``auto``: if the residuals show a trend with a joint's position, errors of the joints'
             transmissions are looked for and, where the data show them, learnt; ``off``: they are not.
-        order_check: ``auto``: ask whether the residuals know when they were measured; ``off``: do not.
-        starts: Other starts that must end in the same minimum.
-        required_accuracy: Largest error at a pose that the user can live with [m], for the verdict.
+        order_check: ``auto``: test whether the residuals show a trend with time; ``off``: do not.
+        starts: Number of other starts, which must end in the same minimum.
+        required_accuracy: Largest acceptable error at a pose [m], for the verdict.
     """
 
     robot: Robot
@@ -127,14 +127,14 @@ class IdentificationProblem:
 
 # ── What is known of the parameters before the data: a Gaussian, Π_k ~ N(m, C) ──────────────────────────────
 # A prior adds equations to the least squares (maximum a posteriori): with C = L Lᵀ, rows L⁻¹ against L⁻¹ (m − Π).
-# It steadies parameters that the data hardly see, and costs a little bias in those they do.
+# It determines parameters that the data hardly see, at the cost of a little bias in the others.
 
 LENGTH_STD = 5e-4
-"""How far lengths of an assembled industrial robot typically are from the data sheet [m]."""
+"""Typical deviation of the lengths of an assembled industrial robot from the data sheet [m]."""
 ANGLE_STD = 1e-3
 """The same for angles between axes [rad]."""
 OFFSET_STD = 0.02
-"""The same for the zeros of joints, which are set by hand, in any unit [rad | m]."""
+"""The same for the zero positions of joints, which are set by hand [rad | m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,7 @@ class Prior:
 def typical_prior(robot: Robot, length_std: float = LENGTH_STD, angle_std: float = ANGLE_STD) -> Prior | None:
     """Nominal values with typical manufacturing errors for all active parameters but base and targets.
 
-    Joint zeros get ``OFFSET_STD``, next to nothing. ``None`` if there is no parameter left.
+    Joint zeros get ``OFFSET_STD``, which is hardly any prior. ``None`` if there is no parameter left.
     """
     zeros = _joint_zeros(robot)
     known = [p for p in robot.parameters if not is_nuisance(p.name)]
@@ -211,7 +211,7 @@ def typical_prior(robot: Robot, length_std: float = LENGTH_STD, angle_std: float
 
 
 def _joint_zeros(robot: Robot) -> set[str]:
-    """Names of the active parameters that act as a joint does, wherever the robot stands."""
+    """Names of the active parameters that move the targets as a joint does, in every configuration."""
     low, high = robot.joint_limits.T
     sample = np.random.default_rng(0).uniform(low, high, (8, len(low)))
     # Reflectors off every axis: an unknown one starts at the tip, where the last joint moves nothing.

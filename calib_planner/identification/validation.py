@@ -4,16 +4,16 @@ At a held-out point the expected covariance of measured − predicted is
 
     J C Jᵀ + D + R,
 
-what is uncertain in the parameters, what no geometric model holds, and the measurement itself. If the covariance
-is honest, 95 % of the points lie inside their 95 % region (χ²₃).
+of the parameters, of the errors that no geometric model describes, and of the measurement itself. If the
+covariance is right, 95 % of the points lie inside their 95 % region (χ²₃).
 
 A *re-seated target* has a new offset, to be found from a few rows of the validation data. The systematic error
-that no geometric model holds would go straight into that offset, so what the calibration residuals predict of it
-at those rows (see ``discrepancy``) is taken off first. The rows that are the test stay as they are. With G the
+that no geometric model describes would go into that offset, so what the calibration residuals predict of it at
+those rows (see ``fit_discrepancy``) is subtracted first. The test rows are not changed. With G the
 pseudoinverse that turns errors e₀ at those rows into an error of the offset, and J_t = ∂p/∂t, the error at a
 test row is (J − J_t G J₀) ΔΠ + e − J_t G e₀.
 
-*Cross-validation* does without further data: the configurations are dealt into folds, and each is predicted by
+*Cross-validation* needs no further data: the configurations are dealt into folds, and each is predicted by
 the fit to the others.
 """
 
@@ -299,7 +299,7 @@ def _statistics(parts: list[list[_Prediction]]) -> Validation:
     )
 
 
-# ── what the predictions rest on ─────────────────────────────────────────────────────────────────────
+# ── what the predictions start from ─────────────────────────────────────────────────────────────────────
 
 
 def _before(problem: IdentificationProblem) -> Robot:

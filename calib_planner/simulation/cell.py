@@ -1,4 +1,7 @@
-"""A robot with hidden true parameters and a tracker with noise. Seeded."""
+"""A robot with hidden true parameters and a tracker with noise; every random number has a seed.
+
+Each purpose has a stream of random numbers of its own, so that switching a fault on changes no other draw.
+"""
 
 from __future__ import annotations
 
@@ -93,9 +96,6 @@ class SimulatedCell:
         """(N, targets) distances between the true robot and ``model``, eq. (4) [m]."""
         difference = self.truth.positions(configurations) - model.positions(configurations)
         return np.linalg.norm(difference, axis=2)
-
-
-# ── One stream of random numbers per purpose: switching a fault on changes no other draw ────────────────────
 
 
 class Purpose(IntEnum):

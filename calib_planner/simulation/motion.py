@@ -14,14 +14,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from calib_planner.acquisition import NANO
 from calib_planner.arrays import FloatArray, IntArray, frozen
 from calib_planner.planning import PEAK
 
-NANO = 1_000_000_000
-
 BACK_OFF = 0.05
 """How far the robot backs off between two standstills at nearly the same place [rad | m]."""
+
+
+def smooth(tau: ArrayLike) -> FloatArray:
+    """s(τ) of times τ (…,) as shares of a move; at rest before and after it."""
+    x = np.clip(tau, 0.0, 1.0)
+    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +45,7 @@ class Phase:
         """(joints,) at ``time`` [s]."""
         if self.end <= self.begin:
             return self.goal
-        x = min(max((time - self.begin) / (self.end - self.begin), 0.0), 1.0)
-        return self.start + (self.goal - self.start) * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+        return self.start + (self.goal - self.start) * smooth((time - self.begin) / (self.end - self.begin))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +88,7 @@ class Tour:
         begin, end, start, goal, measuring, arrival = self._columns
         k = np.maximum(np.searchsorted(begin, times, side="right") - 1, 0)
         length = np.maximum(end[k] - begin[k], 1e-12)
-        x = np.clip((times - begin[k]) / length, 0.0, 1.0)[:, None]
-        joints = start[k] + (goal[k] - start[k]) * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+        joints = start[k] + (goal[k] - start[k]) * smooth((times - begin[k]) / length)[:, None]
         return Stand(joints, arrival[k], np.where(measuring[k], times - begin[k], np.inf))
 
     @cached_property
@@ -138,9 +142,6 @@ def backed_off(q: FloatArray, limits: FloatArray) -> FloatArray:
     """``q`` (n,) moved by ``BACK_OFF`` towards the middle of the limits."""
     middle = limits.mean(axis=1)
     return q + BACK_OFF * np.where(q <= middle, 1.0, -1.0)
-
-
-# ── one tour after the other ─────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, eq=False)

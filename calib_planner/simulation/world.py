@@ -1,7 +1,9 @@
-"""Where the targets really are: a robot whose joints turn beyond their readings and whose arm swings on.
+"""A simulated robot and tracker with faults: where the targets really are, and what the tracker sees of them.
 
-A pure function of where the robot is told to be: nothing here draws as it goes, whatever happens at an arrival is
-drawn from the seed and the arrival's number.
+``World`` is a pure function of where the robot is told to be: whatever happens at an arrival is drawn from the
+seed and the arrival's number. ``Sight`` looks at it: a station that turned by R about its place c and moved by v
+sees a point p at R(p − c) + c + v; beam breaks, outliers and noise come on top. ``simulated`` measures one
+configuration at a time, as a campaign wants it.
 """
 
 from __future__ import annotations
@@ -122,10 +124,6 @@ class World:
         return result
 
 
-# ── What the tracker makes of it: a station that drifts or is pushed, beam breaks, outliers, noise ──────────
-# A station that turned by R about its place c and moved by v sees a point at R(p − c) + c + v.
-
-
 class Sight:
     """A tracker in a ``World``; noise and outliers are drawn in the order of the looks, stream by stream."""
 
@@ -219,9 +217,6 @@ class BeamBreaks:
         latest = begin[np.maximum(count - 1, 0)]
         broken = (count > 0) & (seconds < latest + f.beam_break_duration)
         return broken, np.array(self._wrong)[count]
-
-
-# ── A simulated robot and tracker, measured one configuration at a time ─────────────────────────────────────
 
 
 def simulated(world: World, seed: int, reaches: Callable[[FloatArray], bool] = lambda q: True) -> Instrument:
