@@ -54,7 +54,7 @@ from calib_planner.ros.messages import stamp_message
 from calib_planner.ros.model import first_model
 from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.ros.qos import EVENTS, LATCHED
-from calib_planner.ros.session import Campaign, Matching
+from calib_planner.ros.session import Matching, Session
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.simulation import random_deviations
 
@@ -118,7 +118,7 @@ def prepare(chosen: argparse.Namespace, folder: Path, more: int) -> tuple[np.nda
     )
     found = replace(promised, configurations=q, repetitions=np.ones(len(q), dtype=int))
     store = open_store(str(folder), model.stored, asdict(settings), __version__)
-    campaign = Campaign(model.robot, model.follow, store)
+    campaign = Session(model.robot, model.follow, store)
     campaign.begin("soak", found, settings.plan_tolerance)
     how, mean = Matching(settings.plan_tolerance, False, SIGMA, 0.0, settings.most_measurements), SIGMA / 20**0.5
     began = time.time_ns() - 10 * stored * NANO

@@ -1,4 +1,11 @@
-"""From the parameters of the campaign node to a campaign's problem, and from its stops to plans on the wire."""
+"""A campaign over ROS: its problem from the parameters, measuring its configurations, its status and its results.
+
+``Measuring`` tells the identifier the plan, sends the robot to one configuration at a time and listens to what
+was accepted. Every step has an end. A robot that refuses a configuration cannot reach it; a standstill that the
+identifier rejects, or does not mention, is a failed attempt. A robot or identifier that is not there or does not
+answer, and what would spoil any measurement (``ANYWHERE``), is not the configuration's fault: ``Measuring`` waits
+for it to pass, and tries again every ``RETRY`` seconds.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +32,11 @@ from calib_planner.campaign import (
     Paused,
 )
 from calib_planner.errors import InputError
-from calib_planner.identification import Verdict
 from calib_planner.io import write_estimate, write_measurements
 from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.messages import estimate_to_message, plan_to_message
+from calib_planner.ros.messages import estimate_to_message, plan_to_message, reasons_of
 from calib_planner.ros.model import Model, NotReady, with_targets
 from calib_planner.ros.planning import constraints_of
 from calib_planner.ros.session import confined
@@ -43,7 +49,7 @@ SAME = ("budget", "batch", "validation", "minimum", "attempts", "most_failures",
 
 
 def problem_of(settings: CampaignParameters, model: Model | NotReady) -> CampaignProblem:
-    """What the parameters ask for.
+    """The campaign's problem.
 
     Raises:
         NotReady: There is no robot yet.
@@ -75,10 +81,10 @@ class Announced:
     """A plan that the identifier is told.
 
     Attributes:
-        plan_id: Its name.
+        plan_id: Name of the plan.
         plan: The plan.
-        numbers: Number of the campaign's configuration in each row.
-        role: What they are for, ``fit`` or ``validation``.
+        numbers: Number of each row's configuration in the campaign.
+        role: What they are measured for, ``fit`` or ``validation``.
     """
 
     plan_id: str
@@ -86,22 +92,22 @@ class Announced:
     numbers: tuple[int, ...]
     role: str
 
-    def covers(self, stop: int, state: CampaignState) -> bool:
-        """Whether the stop is in it as it is now: for the same purpose, and as often."""
-        if stop not in self.numbers or state.configurations[stop].role != self.role:
+    def covers(self, number: int, state: CampaignState) -> bool:
+        """Whether the plan has the configuration as the campaign wants it now: for that role, and as often."""
+        if number not in self.numbers or state.configurations[number].role != self.role:
             return False
-        return bool(self.plan.repetitions[self.numbers.index(stop)] == state.configurations[stop].times)
+        return bool(self.plan.repetitions[self.numbers.index(number)] == state.configurations[number].times)
 
     def part(self, row: int) -> Plan:
-        """One row, to be measured once."""
+        """A plan of one row, to be measured once."""
         q = self.plan.configurations[row : row + 1]
         return replace(self.plan, configurations=q, repetitions=np.array([1]))
 
 
 def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
-    """All stops of ``role`` that were measured or are to be: what the identifier matches standstills to."""
+    """The plan of all configurations of ``role`` that were measured or are to be, for the identifier to match."""
     measured = {r.index for r in state.measurements}
-    stops = [
+    rows = [
         i for i, s in enumerate(state.configurations) if s.role == role and (i in measured or i in state.queue)
     ]
     problem, last = state.problem, state.rounds[-1] if state.rounds else None
@@ -111,8 +117,8 @@ def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
         robot=problem.robot.name,
         parameters=problem.robot.parameter_names,
         joint_names=problem.robot.joint_names,
-        configurations=np.array([state.configurations[i].q for i in stops]),
-        repetitions=np.array([state.configurations[i].times for i in stops]),
+        configurations=np.array([state.configurations[i].q for i in rows]),
+        repetitions=np.array([state.configurations[i].times for i in rows]),
         test_poses=poses,
         weights=np.full(len(poses), 1.0 / len(poses)),
         sigma=problem.instrument.typical,
@@ -125,14 +131,8 @@ def announced(state: CampaignState, campaign_id: str, role: str) -> Announced:
             seed=problem.seed,
         ),
     )
-    return Announced(f"{campaign_id}-{role}-{uuid.uuid4().hex[:8]}", plan, tuple(stops), role)
+    return Announced(f"{campaign_id}-{role}-{uuid.uuid4().hex[:8]}", plan, tuple(rows), role)
 
-
-# ── Measuring what a campaign wants measured: tell the identifier the plan, send the robot, hear what was acc
-# One configuration at a time, and every step has an end. A robot that refuses a configuration cannot reach it; a
-# standstill that the identifier rejects, or of which it says nothing, is a failed attempt. What is not there,
-# does not answer or would spoil any measurement (``ANYWHERE``) is not the configuration's fault: it is waited
-# for, and tried again every ``RETRY`` seconds.
 
 RETRY = 2.0
 """Time between two attempts at something that did not answer [s]."""
@@ -150,18 +150,18 @@ class Visit:
     """Measuring one configuration once.
 
     Attributes:
-        action: What the campaign wants.
+        action: What the campaign wants measured.
         since: When the phase began [s].
         phase: ``telling`` the plan, ``sending`` the robot, ``moving``, ``judging`` (the identifier does).
-        said: The identifier's last reason for a rejection.
-        anywhere: Whether that was one of ``ANYWHERE``.
-        final: Whether this standstill is not judged again.
+        reason: Why the identifier rejected a standstill meanwhile; empty if it rejected none.
+        anywhere: Whether it was for one of ``ANYWHERE``.
+        final: Whether the identifier will not judge this standstill again.
     """
 
     action: Measure
     since: float
     phase: str = "telling"
-    said: str = ""
+    reason: str = ""
     anywhere: bool = False
     final: bool = False
 
@@ -174,42 +174,41 @@ class Measuring:
     """The robot and the identifier, as a campaign needs them; made in ``configure`` of ``node``.
 
     Args:
-        plans: Where the identifier hears of plans.
+        node: The campaign's node.
+        plans: Publishes plans to the identifier.
 
     Attributes:
-        visit: What is being measured.
-        waiting: What is waited for; empty if for nothing.
-        taken: The plan that the identifier has.
+        visit: What is being measured; ``None`` if nothing is.
+        waiting: What is awaited; empty if nothing is.
+        taken: Name of the plan that the identifier has.
     """
 
     def __init__(self, node: ManagedNode[CampaignParameters], plans: Publisher) -> None:
-        self._node, self._out = node, plans
+        self._node, self._out, self.taken = node, plans, ""
         self._execution = PlanExecution(node, node.settings.value.execute_action)
         self.begin("")
 
     def begin(self, campaign_id: str) -> None:
-        """Nothing is known of any plan."""
-        self._id, self._plan = campaign_id, None
+        """Begin a campaign, of which the identifier knows no plan yet."""
+        self._id = campaign_id
+        self._plan: Announced | None = None
         self._plans: dict[str, Announced] = {}
         self.visit: Visit | None = None
         self.waiting, self._waited_since, self._tried = "", 0.0, 0.0
-        self._spoilt = ""
-
-    taken = ""
-    _plan: Announced | None
+        self._spoilt = ""  # reason of ANYWHERE of the last standstill; empty once a measurement succeeded
 
     @property
     def busy(self) -> bool:
-        """Whether the robot is under way for us."""
+        """Whether the robot executes a goal of this campaign."""
         return self._execution.busy
 
     @property
     def waited(self) -> float:
-        """How long it has been waiting [s]."""
+        """How long ``waiting`` has lasted [s]."""
         return time.monotonic() - self._waited_since if self.waiting else 0.0
 
     def leave(self) -> None:
-        """Nothing is to be measured now: the robot stops."""
+        """Measure nothing now: the robot stops."""
         self.visit, self._spoilt = None, ""
         self._wait_for("")
         self._execution.poll(self._settings.silence)
@@ -221,13 +220,11 @@ class Measuring:
         if fits and self._plan is not fits[-1]:
             self._announce(fits[-1])
 
-    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
-
     def heard(self, message: Measurement, state: CampaignState) -> CampaignState:
-        """What the identifier says of a standstill.
+        """Take what the identifier publishes about a standstill.
 
-        What it holds for an outlier counts as measured: the campaign looks for outliers itself, and its fit shall
-        not depend on what is measured for validation.
+        An outlier counts as measured: the campaign looks for outliers itself, and its fit must not depend on what
+        is measured for validation.
 
         Raises:
             InputError: A measurement of other joints.
@@ -243,23 +240,21 @@ class Measuring:
         if known or plan is None or message.configuration_index >= len(plan.numbers):
             return state
         points = np.array([[p.x, p.y, p.z] for p in message.points])
-        stop = plan.numbers[message.configuration_index]
-        return state.measured(stop, _joints(message, state), points, int(message.id))
+        number = plan.numbers[message.configuration_index]
+        return state.measured(number, _joints(message, state), points, int(message.id))
 
     def _rejected(self, message: Measurement) -> None:
         visit = self.visit
         if visit is None or visit.phase not in ("moving", "judging"):
             return
-        visit.said, visit.anywhere = cut(message.reason, 300), message.status in ANYWHERE
-        # Points tell a standstill that was rejected from one that was none, and may become one yet.
+        visit.reason, visit.anywhere = cut(message.reason, 300), message.status in ANYWHERE
+        # Only a standstill has points; what has none was no standstill and may still become one.
         plan, row = self._plans.get(message.plan_id), message.configuration_index
         here = plan is not None and row < len(plan.numbers) and plan.numbers[row] == visit.action.index
         visit.final = here and len(message.points) > 0
 
-    # ── one step further ─────────────────────────────────────────────────────────────────────────────
-
     def step(self, state: CampaignState, action: Measure) -> CampaignState:
-        """Go on measuring; the state as it is then."""
+        """Go on measuring; returns the state afterwards."""
         ended = self._execution.poll(self._settings.silence)
         visit = self.visit
         if visit is None or (visit.action.index, visit.action.repetition) != (action.index, action.repetition):
@@ -284,7 +279,7 @@ class Measuring:
         return self._node.settings.value
 
     def _tell(self, state: CampaignState, visit: Visit) -> None:
-        """The identifier has to know the plan before the robot stands there."""
+        """Announce the plan and wait until the identifier has it, before the robot goes there."""
         plan = self._plan
         if plan is None or not plan.covers(visit.action.index, state):
             plan = announced(state, self._id, visit.action.role)
@@ -299,19 +294,18 @@ class Measuring:
                 self._announce(plan)
 
     def _announce(self, plan: Announced) -> None:
-        stamp = self._node.get_clock().now().nanoseconds
         self._plan, self._plans[plan.plan_id] = plan, plan
-        self._out.publish(plan_to_message(plan.plan, plan.plan_id, stamp, self._settings.frame_id))
+        self._out.publish(plan_to_message(plan.plan, plan.plan_id, self._node.now, self._settings.frame_id))
 
     def _send(self, visit: Visit) -> None:
-        """The robot goes there."""
+        """Send the robot to the configuration."""
         settings, plan = self._settings, self._plan
         assert plan is not None
         if not self._execution.ready:
             self._wait_for(f"nobody offers {settings.execute_action}: is the robot's node there?")
         elif not self.waiting or self._due():
-            stamp, row = self._node.get_clock().now().nanoseconds, plan.numbers.index(visit.action.index)
-            goal = plan_to_message(plan.part(row), plan.plan_id, stamp, settings.frame_id)
+            part = plan.part(plan.numbers.index(visit.action.index))
+            goal = plan_to_message(part, plan.plan_id, self._node.now, settings.frame_id)
             self._execution.send(ExecutePlan.Goal(plan=goal, dwell=settings.dwell))
             visit.next("moving")
 
@@ -331,23 +325,26 @@ class Measuring:
         return state
 
     def _not_measured(self, state: CampaignState, visit: Visit) -> CampaignState:
-        """The robot stood there, and the identifier did not accept it in time."""
+        """Decide what it means that the robot stood there and the identifier did not accept it in time."""
         name = self._settings.identifier
-        if not visit.said and not self._node.count_publishers(f"{name}/measurements"):
+        if not visit.reason and not self._node.count_publishers(f"{name}/measurements"):
             self._wait_for(f"{name} is not there")
             visit.next("telling")
             return state
         if visit.anywhere:
-            self.visit, self._spoilt = None, visit.said
+            self.visit, self._spoilt = None, visit.reason
             self._wait_for("")
             return state
-        reason = visit.said or f"{name} said nothing within {self._settings.patience:g} s"
+        reason = visit.reason or f"{name} said nothing within {self._settings.patience:g} s"
         self._node.get_logger().warning(f"configuration {visit.action.index}: {reason}")
         self.visit = None
         return state.failed(visit.action.index, reason)
 
     def _wait_for(self, what: str) -> None:
-        """For nothing, if it is empty, but that what spoils measurements passes."""
+        """Note what is awaited.
+
+        An empty string means that nothing is awaited, unless a disturbance is still active.
+        """
         what = what or self._spoilt
         if what and not self.waiting:
             self._waited_since = self._tried = time.monotonic()
@@ -363,21 +360,14 @@ class Measuring:
 
 
 def _joints(message: Measurement, state: CampaignState) -> FloatArray:
-    """Where the robot stood, in its own order of joints."""
+    """(joints,) [rad | m] where the robot stood, in its own order of joints."""
     names = state.problem.robot.joint_names
     if sorted(message.joint_names) != sorted(names):
         raise InputError("measurement.joint_names", listed(message.joint_names), ", ".join(names))
     return pick_joints(message.joint_names, message.joint_positions, names)
 
 
-# ── The end of a campaign: as message, and as files in the folder that the user chose ───────────────────────
-
 FIELD = "store_folder"
-
-
-def reasons_of(verdict: Verdict) -> list[str]:
-    """Reasons as lines, each with what to do."""
-    return [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in verdict.reasons]
 
 
 def result_message(result: CampaignResult, campaign_id: str) -> CalibrationEstimate | None:
@@ -389,7 +379,7 @@ def result_message(result: CampaignResult, campaign_id: str) -> CalibrationEstim
 
 
 def write_result(folder: str, result: CampaignResult, campaign_id: str) -> None:
-    """``measurements_ID.csv``, ``validation_ID.csv``, ``estimate_ID.yaml``.
+    """Write ``measurements_ID.csv``, ``validation_ID.csv`` and ``estimate_ID.yaml``, as far as there are data.
 
     Raises:
         CalibPlannerError: They cannot be written.
@@ -400,8 +390,6 @@ def write_result(folder: str, result: CampaignResult, campaign_id: str) -> None:
     if result.estimate is not None:
         write_estimate(confined(folder, f"estimate_{campaign_id}.yaml"), result.estimate, FIELD)
 
-
-# ── A campaign's state as message ───────────────────────────────────────────────────────────────────────────
 
 OUTCOME = {
     "": CampaignStatus.OUTCOME_OPEN,
@@ -415,17 +403,17 @@ NAN = float("nan")
 
 
 def idle_status(reason: str) -> CampaignStatus:
-    """No campaign was begun."""
-    numbers = dict.fromkeys(
-        ("predicted_accuracy", "required_accuracy", "sigma", "validation_rms", "validation_predicted"), NAN
-    )
-    return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **numbers)
+    """The status before the first campaign."""
+    unknown = ("predicted_accuracy", "required_accuracy", "sigma", "validation_rms", "validation_predicted")
+    return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **dict.fromkeys(unknown, NAN))
 
 
 def status_message(state: CampaignState, campaign_id: str, waiting: str, reason: str) -> CampaignStatus:
-    """How a campaign stands, without stamp.
+    """The status of a campaign, without stamp.
 
     Args:
+        state: The campaign.
+        campaign_id: Its name.
         waiting: What it waits for; empty if for nothing.
         reason: What else there is to say.
     """
@@ -476,8 +464,7 @@ def _state(state: CampaignState, waiting: str) -> int:
 
 def _fill_result(message: CampaignStatus, result: CampaignResult) -> None:
     message.predicted_accuracy = NAN if math.isinf(result.accuracy) else result.accuracy
-    message.verdict = result.verdict.level
-    message.reasons = reasons_of(result.verdict)
-    found = None if result.estimate is None else result.estimate.validation
-    if found is not None:
-        message.validation_rms, message.validation_predicted = found.rms, found.predicted_rms
+    message.verdict, message.reasons = result.verdict.level, reasons_of(result.verdict)
+    validation = None if result.estimate is None else result.estimate.validation
+    if validation is not None:
+        message.validation_rms, message.validation_predicted = validation.rms, validation.predicted_rms

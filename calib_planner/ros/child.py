@@ -1,8 +1,8 @@
-"""``python -m calib_planner.ros.child NAME_node …``: a node that ends when whoever started it is no more.
+"""``python -m calib_planner.ros.child NAME_node …``: a node that ends with the process that started it.
 
-The parent holds the other end of this process's standard input and never writes to it. However the parent ends,
-by ``kill -9`` too, the system closes that end: then the node is told to end as Ctrl-C would tell it, and one that
-does not is ended. ``processes.Nodes`` starts nodes like this.
+That process holds the other end of this process's standard input and never writes to it. When it ends, even by
+``kill -9``, the system closes that end: then the node is told to end, as Ctrl-C would tell it, and a node that
+does not end in time is ended. ``processes.Nodes`` starts nodes like this.
 """
 
 from __future__ import annotations

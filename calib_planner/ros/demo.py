@@ -1,7 +1,11 @@
-"""The demo's own node: asks for a plan, has it executed, follows the estimates.
+"""``python -m calib_planner.ros.demo``: a KUKA KR-270 is calibrated over ROS 2 from start to end.
 
-Calls are repeated with a time-out, since an answer can be published before discovery has matched its reader.
-Nothing waits without a deadline.
+Three processes (planner, identifier, simulated tracker) with DDS between them, and this one that asks for a plan,
+has it measured, and compares what was identified with the truth that only the simulator knew. The truth follows
+from the seed by the function that the simulator uses; no message carries it.
+
+``DemoClient`` repeats calls after a time-out, since an answer can be published before discovery has matched its
+reader. Every wait has a deadline.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +35,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
 
-from calib_planner.demo import DemoResult, demo_report, draw, print_table
+from calib_planner.demo import ROBOT, TEST_POSE, DemoResult, demo_report, draw, print_table
 from calib_planner.errors import CalibPlannerError, InfeasibleError
 from calib_planner.planning import PlanProblem
 from calib_planner.robot import Robot
@@ -44,18 +48,23 @@ from calib_planner.units import length
 ATTEMPT = 8.0
 """Seconds after which an unanswered call is repeated."""
 NOT_YET = (PlanCalibration.Response.BUSY, PlanCalibration.Response.NOT_READY)
-"""Answers of a planner that is still planning or not active yet: asked again after a pause."""
+"""Answers of a planner that is still planning or not active yet: the call is repeated after ``PAUSE``."""
 PAUSE = 0.3
-"""That pause [s]."""
+"""Time between a call that came too early and the next one [s]."""
+LEVEL = "lengths+offsets"
+SIGMA = 3e-5
+"""Standard deviation of one coordinate of one tracker point [m]."""
+SAMPLES = 20
+"""Points averaged per measurement."""
 
 
 class DemoClient:
-    """Talks to the three nodes; spins itself while it waits.
+    """Talks to the three nodes; its node is spun while it waits.
 
     Args:
         domain: ROS domain id.
-        check: Called while waiting; raises if something is wrong, e.g. a node has ended.
-        name: Of the node.
+        check: Called while waiting; raises if something is wrong, for example a node has ended.
+        name: Name of its node.
     """
 
     def __init__(
@@ -85,7 +94,7 @@ class DemoClient:
         rclpy.shutdown(context=self._context)
 
     def wait(self, condition: Callable[[], bool], seconds: float, what: str = "") -> bool:
-        """Spin until ``condition``; ``False`` after ``seconds``, or an error if ``what`` names the thing."""
+        """Spin until ``condition``; after ``seconds`` return ``False``, or raise if ``what`` names a thing."""
         deadline = time.monotonic() + seconds
         while not condition():
             self._check()
@@ -97,10 +106,10 @@ class DemoClient:
         return True
 
     def request_plan(self, request: PlanCalibration.Request, seconds: float = 90.0) -> PlanMessage:
-        """A plan for ``request``.
+        """The plan for ``request``.
 
         Raises:
-            InfeasibleError: The planner refused; says why.
+            InfeasibleError: The planner refused; the error says why.
         """
         response = self._call(self._plan, request, seconds, "plan")
         if response.status != PlanCalibration.Response.SUCCESS:
@@ -108,7 +117,7 @@ class DemoClient:
         return response.plan
 
     def save(self, seconds: float = 20.0) -> str:
-        """Have the identifier save; returns what it says."""
+        """Have the identifier save; returns its answer."""
         response = self._call(self._save, Trigger.Request(), seconds, "answer from save")
         if not response.success:
             raise CalibPlannerError(f"saving failed: {response.message}")
@@ -131,7 +140,7 @@ class DemoClient:
         return self.identifier_has(plan.plan_id) and bool(self.estimate.complete)  # type: ignore[union-attr]
 
     def execute(self, plan: PlanMessage, seconds: float, on_progress: Callable[[], None] = lambda: None) -> None:
-        """Have a plan measured until the estimate covers it; what was missed is done again.
+        """Have a plan measured until the estimate covers it; what was not accepted is measured again.
 
         Raises:
             CalibPlannerError: The simulator refused, or time ran out.
@@ -159,7 +168,7 @@ class DemoClient:
         sent = self._execute.send_goal_async(ExecutePlan.Goal(plan=plan), feedback_callback=self._on_feedback)
         self.wait(lambda: sent.done() or done(), ATTEMPT)
         if not sent.done() or sent.result() is None:
-            # Unanswered: if it runs all the same, its end shows in the estimates.
+            # There was no answer; the goal may run all the same, and the estimates then show its end.
             self.wait(done, ATTEMPT)
             return None
         finished = sent.result().get_result_async()
@@ -171,7 +180,7 @@ class DemoClient:
         n = len(plan.joint_names)
         left = [max(r - c, 0) for r, c in zip(plan.repetitions, self.measured(plan), strict=True)]
         rows = [i for i, count in enumerate(left) if count] or list(range(len(left)))
-        part = PlanMessage(
+        return PlanMessage(
             plan_id=plan.plan_id,
             robot=plan.robot,
             parameters=plan.parameters,
@@ -180,7 +189,6 @@ class DemoClient:
             repetitions=[max(left[i], 1) for i in rows],
             sigma=plan.sigma,
         )
-        return part
 
     def _call(self, client: Any, request: Any, seconds: float, what: str) -> Any:
         deadline = time.monotonic() + seconds
@@ -203,49 +211,32 @@ class DemoClient:
         self.feedback = message.feedback
 
 
-# ── ``python -m calib_planner.ros.demo``: a KUKA KR-270 is calibrated over ROS 2, start to end ──────────────
-# Three processes (planner, identifier, simulated tracker) with DDS between them, and this one that asks for a
-# plan, has it measured, and compares what was identified with the truth that only the simulator knew. The truth
-# comes from the seed, by the function that the simulator uses; it never travels.
-
-ROBOT, LEVEL = "kuka_kr270", "lengths+offsets"
-TEST_POSE = tuple(math.radians(x) for x in (0, -60, 90, 0, 45, 0))
-SIGMA = 3e-5
-"""Standard deviation of one coordinate of one tracker point [m]."""
-SAMPLES = 20
-"""Points averaged per measurement."""
-
-
-@dataclass
 class Screen:
     """Progress on stderr: a moving bar on a terminal, lines elsewhere."""
 
-    console: Console = field(default_factory=lambda: Console(stderr=True))
-
-    def __post_init__(self) -> None:
-        self._live = self.console.is_terminal
-        self._began, self._said = time.monotonic(), ""
+    def __init__(self) -> None:
+        self.console = Console(stderr=True, highlight=False)
+        self._began, self._text = time.monotonic(), ""
         columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        self._bar = Progress(*columns, console=self.console, transient=True, disable=not self._live)
+        self._bar = Progress(*columns, console=self.console, transient=True, disable=not self.console.is_terminal)
         self._task = self._bar.add_task("starting", total=None)
         self._bar.start()
 
-    def say(self, text: str, done: int | None = None, total: int | None = None) -> None:
+    def say(self, text: str, done: int = 0, total: int | None = None) -> None:
         """Show what is being done, and how far it is."""
-        if self._live:
-            self._bar.update(self._task, description=text, completed=done or 0, total=total)
-        elif text != self._said:
-            self.console.print(f"{time.monotonic() - self._began:5.1f} s  {text}", highlight=False)
-        self._said = text
+        self._bar.update(self._task, description=text, completed=done, total=total)
+        if self._bar.disable and text != self._text:
+            self.console.print(f"{time.monotonic() - self._began:5.1f} s  {text}")
+        self._text = text
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Leave the terminal clean."""
         self._bar.stop()
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the demo is asked for; ``folder`` gets the files."""
+    """Size and seed of the demo, and the folder for its files."""
 
     configurations: int
     seed: int
@@ -256,7 +247,7 @@ def run_demo(options: Options, screen: Screen) -> DemoResult:
     """Plan, measure and identify; returns the comparison with the truth.
 
     Raises:
-        CalibPlannerError: Says what failed, with the last lines of a node that ended.
+        CalibPlannerError: The error says what failed, with the last lines of a node that ended.
     """
     with own_domain() as domain, Nodes(options.folder / "log", domain) as nodes:
         screen.say("starting planner, identifier and simulated tracker")
@@ -268,7 +259,7 @@ def run_demo(options: Options, screen: Screen) -> DemoResult:
         try:
             plan = _measure(options, client, screen)
             screen.say("saving")
-            screen.console.print(client.save(), highlight=False)
+            screen.console.print(client.save())
             estimate = estimate_from_message(client.estimate)
         finally:
             client.close()
@@ -284,7 +275,7 @@ def run_demo(options: Options, screen: Screen) -> DemoResult:
 
 
 def _measure(options: Options, client: DemoClient, screen: Screen) -> PlanMessage:
-    """Have a plan made and measured; the client then holds the estimate."""
+    """Have a plan made and measured; the client holds the estimate afterwards."""
     screen.say("waiting for the planner")
     request = PlanCalibration.Request(
         robot=ROBOT,
@@ -299,8 +290,7 @@ def _measure(options: Options, client: DemoClient, screen: Screen) -> PlanMessag
     best = 1e3 * plan.predicted_accuracy
     screen.console.print(
         f"planned: ρ0 = {best:.4f} mm at the test pose, at least {100 * plan.efficiency:.0f} % of what any "
-        f"plan could reach ({plan.seconds:.1f} s)",
-        highlight=False,
+        f"plan could reach ({plan.seconds:.1f} s)"
     )
     client.wait(lambda: client.identifier_has(plan.plan_id), 30.0, "estimate from the identifier")
 
@@ -313,7 +303,7 @@ def _measure(options: Options, client: DemoClient, screen: Screen) -> PlanMessag
 
 
 def _error(client: DemoClient) -> str:
-    """What the newest estimate promises, in words."""
+    """The accuracy that the newest estimate predicts, in words."""
     accuracy = np.asarray(client.estimate.predicted_accuracy) if client.estimate else np.empty(0)
     if not accuracy.size:
         return ""
@@ -340,14 +330,14 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         result = run_demo(Options(chosen.configurations, chosen.seed, chosen.output), screen)
     except (CalibPlannerError, OSError) as error:
-        screen.stop()
+        screen.close()
         print(f"demo: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        screen.stop()
+        screen.close()
         print("demo: interrupted; all nodes were ended", file=sys.stderr)
         return 130
-    screen.stop()
+    screen.close()
     if chosen.json:
         print(json.dumps(result.to_dict()))
     else:

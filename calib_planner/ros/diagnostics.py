@@ -1,7 +1,7 @@
-"""What the identifier says on ``/diagnostics``: its streams, its campaign, its estimate, its store.
+"""What the identifier publishes on ``/diagnostics``: its streams, its session, its estimate, its store.
 
-Pure: a snapshot goes in, a message comes out. Levels: ERROR where nothing can be accepted, WARN where somebody
-should look, STALE where nothing is heard, OK else.
+A snapshot goes in and a message comes out. The level is ERROR where no measurement can be accepted, WARN where
+somebody should look, STALE where no message comes, and OK otherwise.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from calib_planner.acquisition import NANO, Intake, Offset
 from calib_planner.identification import Estimate
 from calib_planner.io import UnavailableStore
 from calib_planner.ros.messages import stamp_message
-from calib_planner.ros.session import Campaign, condition_of
+from calib_planner.ros.session import Session, condition_of
 from calib_planner.units import cut, milliseconds
 
 OK, WARN, ERROR, STALE = (
@@ -78,28 +78,28 @@ def diagnostics(
     stamp: int,
     streams: Sequence[StreamHealth],
     bound: float,
-    campaign: Campaign | None,
+    session: Session | None,
     waiting: str,
 ) -> DiagnosticArray:
     """The message.
 
     Args:
-        name: Of the node.
+        name: Name of the node.
         stamp: Now [ns].
-        streams: Joints first.
+        streams: The streams, joints first.
         bound: Largest clock offset [s].
-        campaign: The campaign, or ``None``.
-        waiting: Why there is none.
+        session: The session, or ``None``.
+        waiting: Why there is no session.
     """
-    robot = "" if campaign is None else campaign.robot.name
+    robot = "" if session is None else session.robot.name
     parts = [(f"stream {s.name}", *_stream(s, bound)) for s in streams]
-    if campaign is None:
+    if session is None:
         parts.append(("campaign", ERROR, waiting, {}))
     else:
         parts += [
-            ("campaign", *_campaign(campaign)),
-            ("estimate", *_estimate(campaign)),
-            ("store", *_store(campaign)),
+            ("campaign", *_campaign(session)),
+            ("estimate", *_estimate(session)),
+            ("store", *_store(session)),
         ]
     message = DiagnosticArray()
     message.header.stamp = stamp_message(stamp)
@@ -108,6 +108,7 @@ def diagnostics(
 
 
 Finding = tuple[bytes, str, Mapping[str, object]]
+"""Level, message and values."""
 
 
 def _stream(s: StreamHealth, bound: float) -> Finding:
@@ -133,55 +134,55 @@ def _stream(s: StreamHealth, bound: float) -> Finding:
     return OK, f"{s.rate:.0f} Hz", values
 
 
-def _campaign(campaign: Campaign) -> Finding:
-    rejections, missing = campaign.rejections, campaign.missing()
+def _campaign(session: Session) -> Finding:
+    rejections, missing = session.rejections, session.missing()
     values: dict[str, object] = {
-        "plan": campaign.plan_id,
-        "planned measurements": 0 if campaign.plan is None else campaign.plan.measurements,
-        "accepted": len(campaign.accepted),
+        "plan": session.plan_id,
+        "planned measurements": 0 if session.plan is None else session.plan.measurements,
+        "accepted": len(session.accepted),
         "rejected": sum(rejections.values()),
         **{f"rejected: {status}": count for status, count in sorted(rejections.items())},
         "configurations missing": len(missing),
-        "complete": campaign.complete,
+        "complete": session.complete,
         "next configuration": "",
         "next joints [rad | m]": "",
     }
-    if campaign.plan is None:
+    if session.plan is None:
         return WARN, "there is no plan", values
     if not missing:
         return OK, "complete", values
-    q = campaign.plan.configurations[missing[0]].tolist()
-    pairs = zip(campaign.plan.joint_names, q, strict=True)
+    q = session.plan.configurations[missing[0]].tolist()
+    pairs = zip(session.plan.joint_names, q, strict=True)
     values["next configuration"] = missing[0]
     values["next joints [rad | m]"] = ", ".join(f"{n}={v:.4f}" for n, v in pairs)
     return OK, f"{len(missing)} configurations missing, next {missing[0]}", values
 
 
-def _estimate(campaign: Campaign) -> Finding:
-    found = campaign.newest
-    if not isinstance(found, Estimate):
-        text = "no estimate yet" if found is None else found.message
-        return (OK if found is None or found.missing else WARN), text, {}
+def _estimate(session: Session) -> Finding:
+    estimate = session.newest
+    if not isinstance(estimate, Estimate):
+        text = "no estimate yet" if estimate is None else estimate.message
+        return (OK if estimate is None or estimate.missing else WARN), text, {}
     values = {
-        "parameters": len(found.fit.parameters),
-        "rank": found.observability.rank,
-        "condition": f"{condition_of(found):.3g}",
-        "points used": found.points.used,
-        "outliers": len(found.points.rejected),
-        "noise of a coordinate [m]": f"{found.noise.sigma:.3g}",
-        "residual rms [m]": f"{found.residuals.after.rms:.3g}",
-        "predicted accuracy [m]": f"{found.accuracy.overall:.3g}",
-        "verdict": found.verdict.level,
-        "seconds": f"{found.diagnostics.seconds:.4f}",
+        "parameters": len(estimate.fit.parameters),
+        "rank": estimate.observability.rank,
+        "condition": f"{condition_of(estimate):.3g}",
+        "points used": estimate.points.used,
+        "outliers": len(estimate.points.rejected),
+        "noise of a coordinate [m]": f"{estimate.noise.sigma:.3g}",
+        "residual rms [m]": f"{estimate.residuals.after.rms:.3g}",
+        "predicted accuracy [m]": f"{estimate.accuracy.overall:.3g}",
+        "verdict": estimate.verdict.level,
+        "seconds": f"{estimate.diagnostics.seconds:.4f}",
     }
-    reasons = "; ".join(r.text for r in found.verdict.reasons if r.level != "PASS")
-    level = OK if found.fit.status == "ok" else WARN
-    return level, reasons or found.fit.message, values
+    reasons = "; ".join(r.text for r in estimate.verdict.reasons if r.level != "PASS")
+    level = OK if estimate.fit.status == "ok" else WARN
+    return level, reasons or estimate.fit.message, values
 
 
-def _store(campaign: Campaign) -> Finding:
-    store = campaign.store
-    values = {"file": "" if store.path is None else store.path, "standstills kept": len(campaign.kept)}
+def _store(session: Session) -> Finding:
+    store = session.store
+    values = {"file": "" if store.path is None else store.path, "standstills kept": len(session.records)}
     if store.trouble:
         return ERROR, f"the last standstill was not stored: {store.trouble}; the next one tries again", values
     if store.path is None and not isinstance(store, UnavailableStore):

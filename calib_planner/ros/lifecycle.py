@@ -17,13 +17,15 @@ answers that it failed.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionServer
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
@@ -33,8 +35,9 @@ from rclpy.publisher import Publisher
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
-from calib_planner.errors import CalibPlannerError, UnknownNameError
+from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.ros.parameters import QOS, NodeParameters, parameter
 from calib_planner.ros.qos import REQUESTS, overridable, own
 from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
@@ -90,8 +93,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             raise
         self._first: Timer | None = None
         if self.settings.value.autostart:
-            steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may not run yet
-            self._first = super().create_timer(0.0, self._autostart, clock=steady)
+            self._first = self.create_steady_timer(0.0, self._autostart)
 
     # ── what a node says about itself ────────────────────────────────────────────────────────────────
 
@@ -115,6 +117,20 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     def is_active(self) -> bool:
         """Whether the state is *active*."""
         return self.state == "active"
+
+    def check_active(self) -> None:
+        """Refuse if the node is not active.
+
+        Raises:
+            InputError: It is not.
+        """
+        if not self.is_active:
+            raise InputError("node", self.state, "active", "activate it")
+
+    @property
+    def now(self) -> int:
+        """The node's time [ns]."""
+        return int(self.get_clock().now().nanoseconds)
 
     def close(self) -> bool:
         """End everything when the process ends; returns whether nothing is under way any more.
@@ -164,7 +180,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         try:
             getattr(self, hook)()
         except Exception as error:
-            self.failure = _reason(error)
+            self.failure = reason_of(error)
             self.get_logger().error(f"cannot {hook}: {self.failure}")
             self._attempt(self._made.pop().close)
             return FAILURE
@@ -207,8 +223,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             return super().create_publisher(msg_type, topic, qos_profile, **others)
         others.setdefault("qos_overriding_options", overridable())
         made = super().create_publisher(msg_type, topic, own(qos_profile), **others)
-        self._destroy_with(self.destroy_publisher, made)
-        return made
+        return self._destroyed_later(self.destroy_publisher, made)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **others: Any
@@ -218,8 +233,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             return super().create_subscription(msg_type, topic, callback, qos_profile, **others)
         others.setdefault("qos_overriding_options", overridable())
         made = super().create_subscription(msg_type, topic, self._safe(callback), own(qos_profile), **others)
-        self._destroy_with(self.destroy_subscription, made)
-        return made
+        return self._destroyed_later(self.destroy_subscription, made)
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **others: Any
@@ -227,39 +241,49 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         """As rclpy's; an exception in the callback is logged and answered."""
         others.setdefault("qos_profile", REQUESTS)
         made = super().create_service(srv_type, srv_name, self._safe_service(callback), **others)
-        if self._made:
-            lasting(made)
-            self._destroy_with(self.destroy_service, made)
-        return made
+        return self._destroyed_later(self.destroy_service, lasting(made) if self._made else made)
+
+    def create_trigger(self, name: str, action: Callable[[], str]) -> None:
+        """A service Trigger that answers with the text of ``action``, or with why it is refused."""
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                self.check_active()
+                response.message, response.success = action(), True
+            except CalibPlannerError as error:
+                response.message, response.success = cut(error), False
+            return response
+
+        self.create_service(Trigger, name, answer)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *args: Any, **others: Any
     ) -> Timer:
         """As rclpy's; an exception in the callback is logged."""
         made = super().create_timer(timer_period_sec, self._safe(callback), *args, **others)
-        if self._made:
-            self._destroy_with(self.destroy_timer, made)
-        return made
+        return self._destroyed_later(self.destroy_timer, made)
+
+    def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Timer:
+        """A timer of real time, with ``period`` [s]; simulated time may stand still."""
+        return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def create_client(self, *args: Any, **others: Any) -> Any:
         """As rclpy's."""
-        made = super().create_client(*args, **others)
-        if self._made:
-            self._destroy_with(self.destroy_client, made)
-        return made
+        return self._destroyed_later(self.destroy_client, super().create_client(*args, **others))
 
     def create_action_server(
         self, kind: Any, name: str, execute: Callable[..., Any], **others: Any
     ) -> ActionServer:
-        """An action server; ``execute`` answers its own faults, since only it knows the fields of its result."""
-        deep = {f"{part}_service_qos_profile": REQUESTS for part in ("goal", "cancel", "result")}
-        made = LastingActionServer(self, kind, name, execute, **(deep | others))
-        if self._made:
-            self._destroy_with(made.destroy)
-        return made
+        """An action server whose goals may be cancelled; ``execute`` answers its own faults in its own words."""
+        usual = {f"{part}_service_qos_profile": REQUESTS for part in ("goal", "cancel", "result")}
+        usual |= {"callback_group": ReentrantCallbackGroup(), "cancel_callback": lambda _: CancelResponse.ACCEPT}
+        made = LastingActionServer(self, kind, name, execute, **(usual | others))
+        return self._destroyed_later(lambda server: server.destroy(), made)
 
-    def _destroy_with(self, destroy: Callable[..., Any], *made: Any) -> None:
-        self.undo_with(lambda: None if self._ending else destroy(*made))
+    def _destroyed_later(self, destroy: Callable[[Any], Any], made: Any) -> Any:
+        if self._made:
+            self.undo_with(lambda: None if self._ending else destroy(made))
+        return made
 
     # ── callbacks that do not end the process ────────────────────────────────────────────────────────
 
@@ -280,14 +304,14 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
                 return callback(request, response)
             except Exception as error:
                 self._say(error)
-                return failed(type(response), _reason(error))
+                return failed(type(response), reason_of(error))
 
         return safe
 
     def _say(self, error: Exception) -> None:
         # Without a context the process is ending, and nothing can be logged.
         if self.context.ok():
-            self.get_logger().error(_reason(error), throttle_duration_sec=1.0)
+            self.get_logger().error(reason_of(error), throttle_duration_sec=1.0)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """As rclpy's, which raises for an unknown name: here it is refused with the closest valid one."""
@@ -296,6 +320,34 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
                 error = UnknownNameError("parameter", cut(given.name, 100), self.settings.names)
                 return SetParametersResult(successful=False, reason=str(error))
         return super().set_parameters_atomically(parameter_list)
+
+
+class OneAtATime:
+    """Work that takes long, of which one piece is done at a time, in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._busy, self.closing = threading.Lock(), threading.Event()
+
+    @contextmanager
+    def turn(self) -> Iterator[bool]:
+        """Whether nothing else is under way; then this is, until the context is left."""
+        mine = self._busy.acquire(blocking=False)
+        try:
+            yield mine
+        finally:
+            if mine:
+                self._busy.release()
+
+    def end(self, patience: float) -> None:
+        """Set ``closing``, at which the work looks, and wait for its end, at most ``patience`` [s]."""
+        self.closing.set()
+        if self._busy.acquire(timeout=patience):
+            self._busy.release()
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is under way."""
+        return not self._busy.locked()
 
 
 def failed(kind: Any, reason: str) -> Any:
@@ -312,5 +364,6 @@ def failed(kind: Any, reason: str) -> Any:
     return response
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
+    """Why something failed: the text of an error of the library, which explains itself, or kind and text."""
     return cut(str(error) if isinstance(error, CalibPlannerError) else f"{type(error).__name__}: {error}")

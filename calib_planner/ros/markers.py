@@ -1,8 +1,8 @@
-"""A plan for the eye: RViz markers of the robot at every configuration, the targets, their order and the path.
+"""RViz markers of a plan: the robot at every configuration, the targets, their order and the path.
 
-The robot is a skeleton: base, the joints' origins, the tip, and a line to each target. A marker holds all
-skeletons, so that a plan of any size is a handful of markers and one text per configuration, of which there are
-MOST_SHOWN at most: of a larger plan every n-th is drawn. Positions are in the frame of
+The robot is drawn as a skeleton: base, origins of the joints, tip, and a line to each target. One marker holds
+all skeletons, so that a plan of any size is a handful of markers and one text per configuration. At most
+MOST_SHOWN configurations are drawn, evenly spread over a larger plan. Positions are in the frame of
 ``Robot.positions``.
 """
 
@@ -30,13 +30,13 @@ TESTS = np.array([0.84, 0.15, 0.16, 1.0])
 
 
 def plan_markers(plan: Plan, robot: Robot, stamp: int, frame_id: str) -> MarkerArray:
-    """The markers, the first of which deletes those of the plan before.
+    """The markers; the first one deletes those of the plan before.
 
     Args:
-        plan: Its configurations [rad | m].
-        robot: The robot it is for.
-        stamp: Of the headers [ns].
-        frame_id: The frame in which ``robot.positions`` are.
+        plan: The plan, with configurations [rad | m].
+        robot: The robot that it is for.
+        stamp: Stamp of the headers [ns].
+        frame_id: The frame of ``robot.positions``.
     """
     shown = _shown(len(plan.configurations))
     bones, nodes, targets = skeletons(robot, plan.configurations[shown])
@@ -69,7 +69,7 @@ def plan_markers(plan: Plan, robot: Robot, stamp: int, frame_id: str) -> MarkerA
 
 
 def skeletons(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where the robot is at N configurations ``q`` (N, joints) [rad | m].
+    """The robot's skeleton at N configurations ``q`` (N, joints) [rad | m].
 
     Returns:
         Lines (N, 2·B, 3), ends of line b at 2b and 2b + 1; base, joints and tip (N, joints + 2, 3);
@@ -107,7 +107,7 @@ def _marker(name: str, kind: int, points: FloatArray, colours: FloatArray, scale
     marker = Marker(ns=name, type=kind, scale=scale, color=_colour(colours[0]))
     marker.pose.orientation.w = 1.0
     marker.points = [_point(row) for row in points.reshape(-1, 3).tolist()]
-    # Making messages is what takes the time here: the points of a group share one colour.
+    # Making messages takes most of the time here: the points of a group share one colour.
     marker.colors = [one for row in colours.tolist() for one in [_colour(row)] * points.shape[1]]
     return marker
 

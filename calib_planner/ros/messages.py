@@ -1,7 +1,7 @@
-"""Messages to library values and back; nothing here needs a node or spins.
+"""Messages to values of the library and back; nothing here needs a node or spins.
 
-What comes from the wire is checked here and nowhere else: lengths, finiteness, sizes. What does not fit
-raises the library's own errors, with the message's field in ``InputError.field``.
+What comes over the wire is checked here and nowhere else: lengths, finiteness, sizes. What does not fit raises
+the library's own errors, with the message's field in ``InputError.field``.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from calib_planner.acquisition import NANO, Rejection, Standstill, pick_joints
+from calib_planner.acquisition import NANO, Rejection, Standstill
 from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
+from calib_planner.identification import Verdict
 from calib_planner.io import ACCEPTED, DECISIONS
 from calib_planner.planning import STATUS as PLAN_WORDS
 from calib_planner.planning import Pace, Plan, PlanQuality, timetable
@@ -40,6 +41,8 @@ ESTIMATE_STATUS = {
     "not_converged": CalibrationEstimate.STATUS_NOT_CONVERGED,
     "error": CalibrationEstimate.STATUS_ERROR,
 }
+PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency", "seconds")
+"""Fields of ``PlanQuality`` and of the message that are the same number."""
 MEASUREMENT_STATUS = {
     word: getattr(Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}")
     for word in DECISIONS
@@ -52,17 +55,14 @@ def nanoseconds(stamp: Time) -> int:
 
 
 def stamp_message(stamp: int) -> Time:
-    """A stamp [ns] as message; outside what fits into one, the nearest that does."""
+    """A stamp [ns] as message; the nearest that a message can hold."""
     stamp = min(max(stamp, 0), (2**31 - 1) * NANO)
     return Time(sec=stamp // NANO, nanosec=stamp % NANO)
 
 
-# ── plans ────────────────────────────────────────────────────────────────────────────────────────────
-
-
 @dataclass(frozen=True, eq=False)
 class ReceivedPlan:
-    """A plan as it came over the wire: what is needed to execute it and to compare with it.
+    """A plan that came over the wire.
 
     Attributes:
         plan_id: Its name.
@@ -75,33 +75,28 @@ class ReceivedPlan:
 
 def plan_to_message(plan: Plan, plan_id: str, stamp: int, frame_id: str) -> PlanMessage:
     """A plan as message, made at ``stamp`` [ns]."""
+    quality = plan.quality
     message = PlanMessage(
         plan_id=plan_id,
         robot=plan.robot,
-        criterion=plan.quality.criterion,
         parameters=list(plan.parameters),
         joint_names=list(plan.joint_names),
         configurations=plan.configurations.ravel().tolist(),
         repetitions=plan.repetitions.tolist(),
         test_poses=plan.test_poses.ravel().tolist(),
         sigma=float(plan.sigma),
-        predicted_accuracy=float(plan.quality.predicted_accuracy),
-        predicted_accuracy_per_test_pose=plan.quality.predicted_accuracy_per_test_pose.tolist(),
-        lower_bound=float(plan.quality.lower_bound),
-        efficiency=float(plan.quality.efficiency),
-        bound=plan.quality.bound,
-        seed=int(plan.quality.seed) % 2**32,
-        seconds=float(plan.quality.seconds),
-        status=PLAN_STATUS[plan.quality.status],
-        message=plan.quality.message,
+        predicted_accuracy_per_test_pose=quality.predicted_accuracy_per_test_pose.tolist(),
+        seed=int(quality.seed) % 2**32,
+        status=PLAN_STATUS[quality.status],
+        **{name: getattr(quality, name) for name in ("criterion", "bound", "message")},
+        **{name: float(getattr(quality, name)) for name in PLAN_NUMBERS},
     )
-    message.header.stamp = stamp_message(stamp)
-    message.header.frame_id = frame_id
+    message.header.stamp, message.header.frame_id = stamp_message(stamp), frame_id
     return message
 
 
 def plan_from_message(message: PlanMessage) -> ReceivedPlan:
-    """Check a plan from the wire.
+    """Check a plan that came over the wire.
 
     Raises:
         InputError: A length that does not fit, a number that is not finite, an unusable status.
@@ -123,6 +118,7 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
     if accuracy.shape != (len(poses),):
         expected = f"{len(poses)} numbers, one per test pose"
         raise InputError("predicted_accuracy_per_test_pose", accuracy.shape, expected)
+    numbers: dict[str, Any] = {name: float(getattr(message, name)) for name in PLAN_NUMBERS}
     plan = Plan(
         robot=message.robot,
         parameters=tuple(message.parameters),
@@ -136,16 +132,13 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
             predicted_accuracy_per_test_pose=accuracy,
             parameter_std=np.full(len(message.parameters), np.nan),
             criterion=message.criterion,
-            predicted_accuracy=float(message.predicted_accuracy),
             value=float(message.predicted_accuracy),
             value_bound=float(message.lower_bound),
-            lower_bound=float(message.lower_bound),
-            efficiency=float(message.efficiency),
             bound=message.bound,
             status=status,
             message=message.message,
-            seconds=float(message.seconds),
             seed=int(message.seed),
+            **numbers,
         ),
     )
     return ReceivedPlan(message.plan_id, plan)
@@ -155,7 +148,7 @@ def check_rows(field: str, flat: ArrayLike, joints: Sequence[str], least: int = 
     """(rows, joints) [rad | m] from a row-major list of finite numbers.
 
     Raises:
-        InputError: The length is no multiple of the number of joints, or too large, or a number not finite.
+        InputError: The length is no multiple of the number of joints, or too large, or a number is not finite.
     """
     values = np.asarray(flat, dtype=float).ravel()
     n = len(joints)
@@ -166,29 +159,11 @@ def check_rows(field: str, flat: ArrayLike, joints: Sequence[str], least: int = 
     return check_array(field, rows, (None, n), meaning="joints in rad or m")
 
 
-# ── measuring ────────────────────────────────────────────────────────────────────────────────────────
-
-
-def joints_from_message(message: JointState, joint_names: Sequence[str]) -> FloatArray:
-    """Positions (joints,) [rad | m] in the order wanted; other joints are ignored, values may be NaN.
-
-    Raises:
-        UnknownNameError: A joint is missing.
-        InputError: A name is there twice, or names and positions differ in number.
-    """
-    return pick_joints(message.name, message.position, joint_names)
-
-
 def joints_message(names: Sequence[str], positions: FloatArray, stamp: int) -> JointState:
     """Positions (joints,) [rad | m] at ``stamp`` [ns]."""
     message = JointState(name=list(names), position=positions.tolist())
     message.header.stamp = stamp_message(stamp)
     return message
-
-
-def point_from_message(message: PointStamped) -> FloatArray:
-    """Point (3,) [m] in the tracker's frame; NaN where not seen."""
-    return np.array([message.point.x, message.point.y, message.point.z])
 
 
 def point_message(xyz: FloatArray, stamp: int, frame_id: str) -> PointStamped:
@@ -199,7 +174,7 @@ def point_message(xyz: FloatArray, stamp: int, frame_id: str) -> PointStamped:
 
 
 def measurement_message(
-    found: Standstill | Rejection,
+    acquired: Standstill | Rejection,
     joint_names: Sequence[str],
     frame_id: str,
     *,
@@ -218,18 +193,18 @@ def measurement_message(
         configuration_index=Measurement.UNPLANNED if index is None else index,
         repetition=repetition,
         joint_names=list(joint_names),
-        joint_positions=found.joints.tolist(),
-        samples=found.samples.tolist(),
-        duration=(found.end - found.start) / NANO,
+        joint_positions=acquired.joints.tolist(),
+        samples=acquired.samples.tolist(),
+        duration=(acquired.end - acquired.start) / NANO,
         status=MEASUREMENT_STATUS[status],
         unused_targets=list(unused),
         reason=reason,
     )
-    message.header.stamp = stamp_message((found.start + found.end) // 2)
+    message.header.stamp = stamp_message((acquired.start + acquired.end) // 2)
     message.header.frame_id = frame_id
-    if isinstance(found, Standstill):
-        message.points = [Point(**_xyz(p)) for p in found.points]
-        message.std = [Vector3(**_xyz(np.full(3, s))) for s in found.std]
+    if isinstance(acquired, Standstill):
+        message.points = [Point(**_xyz(p)) for p in acquired.points]
+        message.std = [Vector3(**_xyz(np.full(3, s))) for s in acquired.std]
     return message
 
 
@@ -237,12 +212,9 @@ def _xyz(values: FloatArray) -> dict[str, float]:
     return dict(zip("xyz", map(float, values), strict=True))
 
 
-# ── estimates ────────────────────────────────────────────────────────────────────────────────────────
-
-
 @dataclass(frozen=True, eq=False)
 class ReceivedEstimate:
-    """The part of an estimate that travels, as arrays; see ``CalibrationEstimate``.
+    """The part of an estimate that a message carries, as arrays; see ``CalibrationEstimate``.
 
     Attributes:
         parameters: P names.
@@ -289,13 +261,18 @@ def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
         "condition": float("nan"),
         "outliers": len(estimate.points.rejected),
         "verdict": estimate.verdict.level,
-        "reasons": [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in estimate.verdict.reasons],
+        "reasons": reasons_of(estimate.verdict),
     }
     return CalibrationEstimate(**(fields | others))
 
 
+def reasons_of(verdict: Verdict) -> list[str]:
+    """The reasons of a verdict as lines, each with what to do."""
+    return [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in verdict.reasons]
+
+
 def estimate_from_message(message: CalibrationEstimate) -> ReceivedEstimate:
-    """Check an estimate from the wire.
+    """Check an estimate that came over the wire.
 
     Raises:
         InputError: Lengths differ, or a value is not finite.
@@ -309,9 +286,6 @@ def estimate_from_message(message: CalibrationEstimate) -> ReceivedEstimate:
     return ReceivedEstimate(names, nominal, deviation, std, accuracy, sigma, float(message.sigma_estimate))
 
 
-# ── A plan as a trajectory for a controller: slow enough, also on the unknown way to its first stop ─────────
-
-
 def pace_of(robot: Robot, turning: float, sliding: float, limits: FloatArray, dwell: float) -> Pace:
     """Joint speeds: ``turning`` [rad/s] or ``sliding`` [m/s], and never above ``limits`` (joints,)."""
     wanted = np.where(robot.joint_is_revolute, turning, sliding)
@@ -319,17 +293,17 @@ def pace_of(robot: Robot, turning: float, sliding: float, limits: FloatArray, dw
 
 
 def trajectory_message(plan: Plan, robot: Robot, pace: Pace, stamp: int, frame_id: str) -> JointTrajectory:
-    """Arrival at and departure from every stop, at rest; only the arrival if nobody stands there.
+    """A plan for a controller: at every visit a point of arrival and one of departure, both at rest.
 
     Args:
         plan: Its configurations [rad | m], in the order of visiting.
-        robot: Its limits bound the way to the first stop, which begins nobody knows where.
-        pace: Speeds and standstill.
-        stamp: Of the header [ns].
-        frame_id: Of the header.
+        robot: Its limits bound the way to the first configuration, whose beginning is unknown.
+        pace: Speeds and standstill; without a standstill there is no point of departure.
+        stamp: Stamp of the header [ns].
+        frame_id: Frame of the header.
 
     Raises:
-        InputError: The tour is longer than a ROS duration can say.
+        InputError: The tour takes longer than a ROS duration can hold.
     """
     times = timetable(plan, robot, pace)
     result = JointTrajectory(joint_names=list(plan.joint_names))

@@ -8,6 +8,7 @@ the current values as one immutable object. ROS itself drops unknown names given
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import Field, field, fields, replace
@@ -66,6 +67,10 @@ def parameter(
     """
     metadata = {"description": description, "unit": unit, "low": low, "high": high, "choices": tuple(choices)}
     return field(default=default, metadata=metadata | {"read_only": read_only, "at_configure": at_configure})
+
+
+at_configure = functools.partial(parameter, at_configure=True)
+"""As ``parameter``; taken by the transition ``configure``."""
 
 
 def constraints_text(item: Field[Any]) -> str:

@@ -1,6 +1,6 @@
-"""Nodes as processes of their own, on a ROS domain of their own, that are always ended.
+"""Nodes as processes, on a ROS domain that nobody else uses.
 
-They end with this process even if it is killed: see ``child``.
+They are ended when ``Nodes`` is left, and end with this process even if it is killed: see ``child``.
 """
 
 from __future__ import annotations
@@ -22,29 +22,20 @@ from types import TracebackType
 from calib_planner.errors import CalibPlannerError
 
 PATIENCE = 8.0
-"""Seconds a process has to end after SIGINT before it is killed."""
+"""Time that a process has to end after SIGINT before it is killed [s]."""
 LAST_WORDS = 2.0
-"""Seconds it then has to say what it was doing."""
+"""Time that it then has to write to its log what it was doing [s]."""
 DOMAINS = 100
-"""ROS allows domains up to 101 without clashes with ephemeral ports; 0 is everybody's."""
+"""ROS allows domains up to 101 without clashes with ephemeral ports; 0 is the default of everybody."""
 PARTICIPANTS = 32
-"""Participants of a domain that are looked for on one machine when discovery is local (rmw_fastrtps)."""
+"""Participants of a domain that rmw_fastrtps looks for on one machine when discovery is local."""
 CLAIM = 119
-"""The number of no participant: its port is the last but one of a domain."""
+"""A participant's number that is never reached; its port is the last but one of a domain."""
 _domains = itertools.count(os.getpid() * 37)
 
 
 class ProcessFailed(CalibPlannerError):
-    """A node ended on its own.
-
-    Attributes:
-        name: The node's module.
-        status: Its exit status.
-    """
-
-    def __init__(self, name: str, status: int, last_lines: str) -> None:
-        self.name, self.status = name, status
-        super().__init__(f"{name} ended with status {status}:\n{last_lines}")
+    """A node ended by itself."""
 
 
 @dataclass
@@ -59,11 +50,11 @@ class _Child:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """A ROS domain id from 1 to 100, of nobody else on this machine until the context is left.
+    """A ROS domain id from 1 to 100 that nobody else on this machine uses until the context is left.
 
-    A participant listens at the port of its domain and of its number there (RTPS 2.5, 9.6.2.3), numbers counted
-    from 0: a domain where all those ports are free has no participant. A socket at the port of a number that is
-    never reached keeps the domain from others who ask here; the system closes it when the process ends.
+    A participant listens at a port that follows from its domain and its number in the domain, counted from 0
+    (RTPS 2.5, 9.6.2.3): a domain whose ports are all free has no participant. A socket at the port of ``CLAIM``
+    keeps the domain from other callers of this function; the system closes it when the process ends.
 
     Raises:
         CalibPlannerError: All domains are in use.
@@ -96,10 +87,10 @@ def _bound(listener: socket.socket, domain: int, participant: int) -> bool:
 
 
 class Nodes:
-    """Starts nodes of this package; a context manager that ends them whatever happens.
+    """Starts nodes of this package; a context manager that ends them in any case.
 
     Args:
-        folder: Gets a log per node.
+        folder: The folder for a log per node.
         domain: ROS domain id.
     """
 
@@ -126,12 +117,12 @@ class Nodes:
                 stdout=sink,
                 stderr=subprocess.STDOUT,
                 env=self._environment,
-                start_new_session=True,  # Ctrl-C reaches them through us, once
+                start_new_session=True,  # or Ctrl-C would reach them twice
             )
         self._children.append(_Child(module, process, log))
 
     def end_one(self, module: str, number: signal.Signals = signal.SIGINT) -> int:
-        """End a node that may be started again, with another log; returns its exit status."""
+        """End one node and set its log aside, so that it may be started again; returns its exit status."""
         child = next(c for c in self._children if c.name == module)
         with _undisturbed():
             status = self._end(number, [child])[module]
@@ -149,7 +140,7 @@ class Nodes:
         for child in self._children:
             status = child.process.poll()
             if status is not None:
-                raise ProcessFailed(child.name, status, child.last_lines())
+                raise ProcessFailed(f"{child.name} ended with status {status}:\n{child.last_lines()}")
 
     def end(self, number: signal.Signals = signal.SIGINT) -> dict[str, int]:
         """End all nodes; returns the exit status of each (negative: had to be killed)."""
@@ -185,7 +176,7 @@ class Nodes:
 
 
 def _abort(process: subprocess.Popen[bytes]) -> None:
-    """Kill it, but first have Python write to the log where each of its threads is."""
+    """Kill a process; before, Python writes to the log where each of its threads is."""
     process.send_signal(signal.SIGABRT)
     try:
         process.wait(LAST_WORDS)
@@ -196,7 +187,7 @@ def _abort(process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Ctrl-C waits: a second one must not leave nodes behind."""
+    """Ignore Ctrl-C meanwhile: a second one must not leave nodes behind."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

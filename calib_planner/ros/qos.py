@@ -1,6 +1,6 @@
 """The qualities of service in use, and how a user overrides them.
 
-Every publisher and subscription of ours takes parameters like
+Every publisher and subscription of the nodes takes parameters like
 
     qos_overrides./tracker/point.subscription.reliability: best_effort
 
@@ -16,25 +16,25 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Results: a late joiner gets the newest."""
+"""Results: a subscriber that comes late gets the newest."""
 
 EVENTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""Every message counts: measurements."""
+"""Measurements, of which none may be lost."""
 
 SENSOR_OUT = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
-"""Streams that we publish."""
+"""Streams that the nodes publish."""
 
 SENSOR_IN = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Streams that we hear: best effort matches every publisher, reliable or not."""
+"""Streams that the nodes subscribe to: best effort matches every publisher, reliable or not."""
 
 STREAM_IN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""The same where none may be missed: five seconds at 1 kHz."""
+"""The same where few may be lost: the queue holds five seconds at 1 kHz."""
 
 REQUESTS = QoSProfile(depth=100)
-"""Requests: rclpy's 10 lose some of a burst, and whoever asked waits for ever."""
+"""Requests: rclpy's depth of 10 loses some of a burst, whose clients then wait for ever."""
 
 DEEPEST = 100_000
-"""Largest depth of a queue that an override may ask for."""
+"""Largest depth of a queue in an override."""
 
 POLICIES = (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY, QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH)
 
@@ -49,7 +49,7 @@ def overridable(entity_id: str | None = None) -> QoSOverridingOptions:
 
 
 def own(qos: QoSProfile | int) -> QoSProfile:
-    """A copy, since rclpy writes overrides into the profile it is given."""
+    """A copy, since rclpy writes overrides into the profile that it gets."""
     return QoSProfile(depth=qos) if isinstance(qos, int) else copy.copy(qos)
 
 

@@ -1,13 +1,18 @@
-"""What has been measured of a plan, and the estimate it gives: the identifier without ROS.
+"""What was measured of a plan, and the estimate from it: the identifier without ROS, and the files that it saves.
 
-A campaign belongs to one plan (or to none); a plan with another name begins a new one, and a plan that comes back
-finds what was measured of it. Everything is in the store before it is in force here, so that a campaign made from
-the same store is this campaign again.
+A session belongs to one plan (or to none). A plan with another name begins a new session, and a plan that comes
+back is met with what was measured of it. Everything is in the store before it counts here, so that a session made
+from the same store is the same session.
 
 Which points to believe is decided by all measurements together, from the beginning, every time one comes or goes
-(χ² against the estimate of the others, ``identification.robust``): an outlier of today may be vindicated by
-tomorrow's measurements. What changes is told and written, nothing is deleted. The estimate depends on which
-measurements there are and on nothing else, which makes it the same after a restart.
+(χ² against the estimate from the others, ``identification.robust``): later measurements may show that a point was
+no outlier. What changes is published and stored, nothing is deleted. The estimate depends on the measurements in
+use and on nothing else, so that it is the same after a restart.
+
+Files are saved in the folder that the user chose and nowhere else. Their names are made of the plan's name, which
+comes over the wire: only letters, digits, ``-`` and ``_`` of it become part of a file name, with a hash where
+something was left out, so that two plans never share a file. A name that is a symbolic link is refused, since
+what it points at is not in the folder.
 """
 
 from __future__ import annotations
@@ -40,14 +45,13 @@ from calib_planner.io import (
     write_measurements,
     write_text,
 )
-from calib_planner.measurements import Measurements, RejectedPoint
+from calib_planner.measurements import Measurements
 from calib_planner.planning import Plan
-from calib_planner.report import InputFile, Provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.units import brief, cut, listed
 
 MOST_REJECTIONS = 10_000
-"""Rejected standstills of a campaign that are written; more are only counted: nobody shall fill the disk."""
+"""Rejected standstills of a session that are stored; more are only counted, so that nobody fills the disk."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +60,10 @@ class Matching:
 
     Attributes:
         tolerance: Largest joint difference to a planned configuration [rad | m].
-        accept_unplanned: Use standstills in no plan.
-        sigma: Standard deviation of one coordinate of one sample [m]; 0: from the samples' scatter.
+        accept_unplanned: Whether standstills at configurations of no plan are accepted.
+        sigma: Standard deviation of one coordinate of one sample [m]; 0: from the scatter of the samples.
         repeatability: Standard deviation that averaging does not reduce [m].
-        most: Measurements kept at most.
+        most: Largest number of measurements in use.
     """
 
     tolerance: float = 0.01
@@ -71,25 +75,25 @@ class Matching:
 
 @dataclass(frozen=True)
 class TooFew:
-    """No estimate yet: ``missing`` is how many configurations at least are still needed; 0: it failed."""
+    """There is no estimate: ``missing`` more configurations are needed at least; 0 if identification failed."""
 
     missing: int
     message: str
 
 
-class Campaign:
+class Session:
     """Measurements of one plan by one robot.
 
     Args:
-        nominal: The robot, its active parameters being the identifier's own choice.
-        follow: Chooses the robot's active parameters for a plan.
-        store: Where everything is kept; the campaign in it goes on.
+        nominal: The robot; its free parameters are those that the identifier chooses without a plan.
+        follow: Chooses the robot's free parameters for a plan.
+        store: Holds everything; the session in it goes on.
 
     Attributes:
         plan_id, plan: The plan, if any.
         robot: The robot whose parameters are identified now.
-        kept: What the identification is given, in the order of measuring: accepted, or an outlier for now.
-        newest: The last estimate, of what is in ``kept``; ``None`` if it has to be made anew.
+        records: The measurements in use, in the order of measuring: accepted, or an outlier at present.
+        newest: The estimate from ``records``; ``None`` if it has to be made anew.
 
     Raises:
         CalibPlannerError: What the store holds does not fit the robot.
@@ -97,22 +101,22 @@ class Campaign:
 
     def __init__(self, nominal: Robot, follow: Callable[[Plan], Robot], store: CampaignStore) -> None:
         self.nominal, self.robot, self.follow, self.store = nominal, nominal, follow, store
-        self.kept: list[Record] = []
+        self.records: list[Record] = []
         self.newest: Estimate | TooFew | None = None
         self._unsaved: dict[int, Record] = {}
         self._others: Counter[str] = Counter()
         self._enter(store.current() or StoredCampaign(0, "", None, ()))
 
-    # ── plans ────────────────────────────────────────────────────────────────────────────────────────
-
     def begin(self, plan_id: str, plan: Plan, tolerance: float, *, keep: bool = False) -> bool:
         """Take a plan; ``False`` if it is the current one.
 
-        A plan that cannot be written now is taken all the same, and written before the first measurement.
+        A plan that cannot be stored now is taken all the same, and stored before the first measurement.
 
         Args:
+            plan_id: Name of the plan.
+            plan: The plan.
             tolerance: See ``Matching``.
-            keep: A plan that is new goes on with the measurements of the one before.
+            keep: Whether a plan that is new begins with the measurements of the plan before.
 
         Raises:
             InputError: The plan is for another robot, or another plan has its name.
@@ -126,7 +130,7 @@ class Campaign:
         known = self.store.find(plan_id, plan)
         if self.plan is not None and self.plan_id == plan_id:
             return False
-        carried = _matched_anew(self.kept, plan, tolerance) if keep and known is None else ()
+        carried = _matched_anew(self.records, plan, tolerance) if keep and known is None else ()
         try:
             self._enter(self.store.begin(plan_id, plan, carried))
         except StoreError:
@@ -136,114 +140,110 @@ class Campaign:
     def _enter(self, stored: StoredCampaign) -> None:
         robot = self.nominal if stored.plan is None else self.follow(stored.plan)
         self.number, self.plan_id, self.plan, self.robot = stored.number, stored.plan_id, stored.plan, robot
-        self.kept = [d for d in stored.records if d.status in KEPT]
-        self._others = Counter(d.status for d in stored.records if d.status not in KEPT)
+        self.records = [r for r in stored.records if r.status in KEPT]
+        self._others = Counter(r.status for r in stored.records if r.status not in KEPT)
         self.newest, self._unsaved = None, {}
 
     def _ensure_begun(self) -> int:
-        """Number of the campaign, which is in the store from now on."""
+        """Number of the session, which is in the store from now on."""
         if self.number == 0:
-            self.number = self.store.begin(self.plan_id, self.plan, self.kept).number
+            self.number = self.store.begin(self.plan_id, self.plan, self.records).number
         return self.number
 
     def reset(self) -> int:
-        """Leave all measurements behind; returns how many.
+        """Begin again without measurements; returns how many were in use.
 
         Raises:
-            StoreError: That cannot be written; nothing was changed.
+            StoreError: That cannot be stored; nothing was changed.
         """
-        count = len(self.kept)
+        count = len(self.records)
         self._enter(self.store.restart(self.plan_id, self.plan))
         return count
 
-    # ── measurements come and go ─────────────────────────────────────────────────────────────────────
-
     def take(
-        self, found: Standstill, how: Matching, frame: str = "", objection: tuple[str, str] | None = None
+        self, standstill: Standstill, how: Matching, frame: str = "", objection: tuple[str, str] | None = None
     ) -> Record:
-        """Decide on a standstill, and keep it if it is accepted and written.
+        """Accept a standstill if it fits and can be stored; returns what became of it.
 
         Args:
+            standstill: The standstill.
+            how: How it is matched.
             frame: Frame of its points.
             objection: Status and reason of a rejection that was decided elsewhere.
         """
-        index, reason = self._match(found.joints, how)
+        index, reason = self._match(standstill.joints, how)
         if objection is not None:
-            return self._reject(Record(found, *objection, index, 0, frame=frame))
+            return self._reject(Record(standstill, *objection, index, 0, frame=frame))
         if reason and not how.accept_unplanned:
-            return self._reject(Record(found, NOT_IN_PLAN, reason, None, 0, frame=frame))
-        if len(self.kept) >= how.most:
-            reason = f"{how.most} measurements are kept at most: raise most_measurements or call ~/reset"
-            return self._reject(Record(found, NOT_IN_PLAN, reason, index, 0, frame=frame))
-        decision = Record(found, ACCEPTED, "", index, self.done()[index], frame=frame)
+            return self._reject(Record(standstill, NOT_IN_PLAN, reason, None, 0, frame=frame))
+        if len(self.records) >= how.most:
+            reason = f"no more than {how.most} measurements are used: raise most_measurements or call ~/reset"
+            return self._reject(Record(standstill, NOT_IN_PLAN, reason, index, 0, frame=frame))
+        record = Record(standstill, ACCEPTED, "", index, self.done()[index], frame=frame)
         try:
-            decision = replace(decision, number=self.store.record(self._ensure_begun(), decision))
+            record = replace(record, number=self.store.record(self._ensure_begun(), record))
         except StoreError as error:
             self._others[NOT_STORED] += 1
-            return decision.now(NOT_STORED, f"not stored: {error}")
-        self.kept.append(decision)
+            return record.now(NOT_STORED, f"not stored: {error}")
+        self.records.append(record)
         self.newest = None
-        return decision
+        return record
 
-    def refuse(self, found: Rejection, frame: str = "") -> Record:
-        """Note a standstill that was none."""
-        return self._reject(Record(found, found.reason.value, found.message, None, 0, frame=frame))
+    def refuse(self, rejection: Rejection, frame: str = "") -> Record:
+        """Note a standstill that gave no measurement."""
+        return self._reject(Record(rejection, rejection.reason.value, rejection.message, None, 0, frame=frame))
 
-    def _reject(self, decision: Record) -> Record:
-        """Count it, and write it if that is possible: it was not promised to anybody."""
-        self._others[decision.status] += 1
+    def _reject(self, record: Record) -> Record:
+        """Count it, and store it if that is possible: a rejection need not survive a restart."""
+        self._others[record.status] += 1
         if self._others.total() > MOST_REJECTIONS:
-            return decision
+            return record
         try:
-            return replace(decision, number=self.store.record(self._ensure_begun(), decision))
+            return replace(record, number=self.store.record(self._ensure_begun(), record))
         except StoreError:
-            return decision
+            return record
 
     def undo(self, number: int = 0) -> Record | None:
-        """Withdraw a measurement, 0 for the newest; ``None`` if there is no such measurement in use.
+        """Withdraw the measurement ``number``, 0 for the newest; ``None`` if no such measurement is in use.
 
         Raises:
-            StoreError: That cannot be written; nothing was changed.
+            StoreError: That cannot be stored; nothing was changed.
         """
-        last = next((d for d in reversed(self.kept) if number in (0, d.number)), None)
-        if last is None:
-            return None
-        return self.withdraw(last, UNDONE, "withdrawn on request")
+        last = next((r for r in reversed(self.records) if number in (0, r.number)), None)
+        return None if last is None else self.withdraw(last, UNDONE, "withdrawn on request")
 
-    def withdraw(self, kept: Record, status: str, reason: str) -> Record:
-        """Use one of ``kept`` no more.
+    def withdraw(self, record: Record, status: str, reason: str) -> Record:
+        """Use one of ``records`` no more.
 
         Raises:
-            StoreError: That cannot be written; nothing was changed.
+            StoreError: That cannot be stored; nothing was changed.
         """
-        gone = kept.now(status, reason)
+        gone = record.now(status, reason)
         self.store.decide(self._ensure_begun(), [gone])
-        self.kept.remove(kept)
-        self._unsaved.pop(kept.number, None)
+        self.records.remove(record)
+        self._unsaved.pop(record.number, None)
         self._others[status] += 1
         self.newest = None
         return gone
 
-    # ── what there is ────────────────────────────────────────────────────────────────────────────────
-
     @property
     def frame(self) -> str:
-        """Frame of the points that are kept; empty if none is, or none was named."""
-        return next((d.frame for d in self.kept if d.frame), "")
+        """Frame of the points in use; empty if there are none, or none was named."""
+        return next((r.frame for r in self.records if r.frame), "")
 
     @property
     def accepted(self) -> list[Record]:
-        """What is used, in the order of measuring."""
-        return [d for d in self.kept if d.status == ACCEPTED]
+        """The accepted measurements, in the order of measuring."""
+        return [r for r in self.records if r.status == ACCEPTED]
 
     @property
     def rejections(self) -> Counter[str]:
         """Standstills that are not used, by status."""
-        return self._others + Counter(d.status for d in self.kept if d.status != ACCEPTED)
+        return self._others + Counter(r.status for r in self.records if r.status != ACCEPTED)
 
     def done(self) -> Counter[int | None]:
         """Accepted measurements per row of the plan."""
-        return Counter(d.index for d in self.accepted)
+        return Counter(r.index for r in self.accepted)
 
     def missing(self) -> list[int]:
         """Rows of the plan that were not measured as often as planned, in its order."""
@@ -258,7 +258,7 @@ class Campaign:
         return self.plan is not None and not self.missing()
 
     def _match(self, joints: FloatArray, how: Matching) -> tuple[int | None, str]:
-        """Row of the plan and, if there is none, why. Unfinished rows come first, then the nearest."""
+        """Row of the plan and, if there is none, the reason."""
         plan = self.plan
         if plan is None:
             return None, "there is no plan: request one, or set accept_unplanned"
@@ -270,20 +270,17 @@ class Campaign:
             return None, f"{text}, plan_tolerance is {how.tolerance:g}: check the pose"
         return best, ""
 
-    # ── the estimate ─────────────────────────────────────────────────────────────────────────────────
-
     def measurements(self, how: Matching) -> Measurements | None:
-        """What is kept, outliers and all, as the library's value; ``None`` if there is nothing."""
-        if not self.kept:
+        """The records, with outliers, as the library's value; ``None`` if there are none."""
+        if not self.records:
             return None
-        found = [d.standstill for d in self.kept]
-        points = np.array([f.points for f in found])
-        std = mean_std(found, how.sigma, how.repeatability)
-        q = np.array([f.joints for f in found])
-        return Measurements(self.robot.joint_names, q, points, std)
+        standstills = [r.standstill for r in self.records]
+        points = np.array([s.points for s in standstills])
+        std = mean_std(standstills, how.sigma, how.repeatability)
+        return Measurements(self.robot.joint_names, np.array([s.joints for s in standstills]), points, std)
 
     def problem(self, how: Matching) -> IdentificationProblem:
-        """What is asked of the identification.
+        """The problem that ``estimate`` solves.
 
         Raises:
             NotEnoughDataError: Nothing was measured yet.
@@ -292,12 +289,12 @@ class Campaign:
         poses = self.plan.test_poses if self.plan is not None and len(self.plan.test_poses) else None
         if data is None:
             raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-        # At every standstill: what takes long is left to the finished campaign, or to its analysis.
+        # An estimate is made after every standstill: what takes long waits until the plan is complete.
         quick = dict(UPDATE) | ({"order_check": "auto"} if self.complete else {})
         return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses, **quick)
 
     def estimate(self, how: Matching) -> Estimate | TooFew:
-        """Identify with what there is."""
+        """Identify with the measurements in use."""
         try:
             self.newest = identify(self.problem(how))
         except NotEnoughDataError as error:
@@ -310,15 +307,16 @@ class Campaign:
         return self.newest
 
     def judge(self) -> list[Record]:
-        """Those of ``kept`` about which the newest estimate thinks otherwise than before.
+        """Apply to ``records`` which points the newest estimate rejects; returns the records that changed.
 
-        What cannot be written now is written with the next: the data it follows from are there.
+        What cannot be stored now is stored with the next change: the measurements from which it follows are
+        stored.
         """
         rejected = defaultdict(list)
         for point in self.newest.points.rejected if isinstance(self.newest, Estimate) else ():
             rejected[point.row].append(point)
         changed = []
-        for row, before in enumerate(self.kept):
+        for row, before in enumerate(self.records):
             own = rejected[row]
             if not own and before.status == ACCEPTED and not before.unused:
                 continue
@@ -326,82 +324,76 @@ class Campaign:
             seen = int((before.standstill.samples > 0).sum())
             status = OUTLIER if own and len(own) == seen else ACCEPTED
             if (status, unused) != (before.status, before.unused):
-                self.kept[row] = before.now(status, _reasons(own), unused)
-                changed.append(self.kept[row])
-        self._unsaved |= {d.number: d for d in changed}
+                reason = "; ".join(f"target {r.target}: {r.reason}" for r in own)
+                self.records[row] = before.now(status, reason, unused)
+                changed.append(self.records[row])
+        self._unsaved |= {r.number: r for r in changed}
         if self._unsaved:
             try:
                 self.store.decide(self._ensure_begun(), list(self._unsaved.values()))
                 self._unsaved = {}
             except StoreError:
-                return changed
+                pass
         return changed
 
 
 def condition_of(estimate: Estimate) -> float:
     """Condition number of the identified parameters, each in units of its own standard deviation; NaN if unknown.
 
-    The square root of that of their correlations: as for a Jacobian, 1 is best.
+    It is the square root of the condition number of their correlations; as for a Jacobian, 1 is best.
     """
     variances = np.diag(estimate.fit.covariance)
-    found = np.isfinite(variances) & (variances > 0)
-    if not found.any():
+    known = np.isfinite(variances) & (variances > 0)
+    if not known.any():
         return float("nan")
-    scale = np.sqrt(variances[found])
-    values = np.linalg.eigvalsh(estimate.fit.covariance[np.ix_(found, found)] / np.outer(scale, scale))
+    scale = np.sqrt(variances[known])
+    values = np.linalg.eigvalsh(estimate.fit.covariance[np.ix_(known, known)] / np.outer(scale, scale))
     return float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else float("inf")
 
 
-def _reasons(rejected: Iterable[RejectedPoint]) -> str:
-    """Why points are not used, in words."""
-    return "; ".join(f"target {r.target}: {r.reason}" for r in rejected)
-
-
 def _nearest_row(plan: Plan, distance: FloatArray, done: Counter[int | None], tolerance: float) -> int | None:
-    """Row of a plan within ``tolerance``: one that is not finished if there is one, then the nearest."""
+    """Row of a plan within ``tolerance``: the nearest of the unfinished rows, or else the nearest of all."""
     near = np.flatnonzero(distance <= tolerance)
     return min((int(i) for i in near), key=lambda i: (done[i] >= plan.repetitions[i], distance[i]), default=None)
 
 
-def _matched_anew(kept: Iterable[Record], plan: Plan, tolerance: float) -> tuple[Record, ...]:
-    """Measurements of another plan, at the rows of this one; those of none stay in use, unplanned."""
+def _matched_anew(records: Iterable[Record], plan: Plan, tolerance: float) -> tuple[Record, ...]:
+    """Measurements of another plan, at the rows of this one; those near no row stay in use, unplanned."""
     done: Counter[int | None] = Counter()
     carried = []
-    for decision in kept:
-        distance = np.abs(plan.configurations - decision.standstill.joints).max(axis=1)
+    for record in records:
+        distance = np.abs(plan.configurations - record.standstill.joints).max(axis=1)
         index = _nearest_row(plan, distance, done, tolerance)
-        carried.append(replace(decision, index=index, repetition=done[index]))
+        carried.append(replace(record, index=index, repetition=done[index]))
         done[index] += 1
     return tuple(carried)
 
-
-# ── Writes what a campaign measured and identified into the folder that the user chose, and nowhere else ────
-# File names are made of the plan's name, which comes over the wire: only letters, digits, ``-`` and ``_`` of it
-# become part of them, with a hash where something was left out, so that two plans never share a file. A file name
-# that is a symbolic link already is refused: what it points at is not in the folder.
 
 FIELD = "save_folder"
 LONGEST_NAME = 40
 
 
-def save(folder: str, campaign: Campaign, how: Matching, urdf: str = "") -> list[Path]:
+def save(folder: str, session: Session, how: Matching, urdf: str = "") -> list[Path]:
     """Write ``measurements_PLAN.csv`` and, if there is one, ``estimate_PLAN.yaml``; returns the paths.
 
     Args:
-        urdf: The robot's nominal URDF, if it has one: then ``calibrated_PLAN.urdf`` is written, too.
+        folder: The folder that the user chose.
+        session: What to save.
+        how: How standstills are weighted.
+        urdf: The robot's nominal URDF; unless it is empty, ``calibrated_PLAN.urdf`` is written, too.
 
     Raises:
         InputError: No folder was chosen, or it cannot be written to.
         NotEnoughDataError: Nothing was measured.
     """
-    data = campaign.measurements(how)
+    data = session.measurements(how)
     if data is None:
         _chosen(folder)
         raise NotEnoughDataError(0, 1, "nothing was measured yet, so there is nothing to save")
-    name = plan_name(campaign.plan_id)
+    name = plan_name(session.plan_id)
     paths = [confined(folder, f"measurements_{name}.csv")]
     write_measurements(paths[0], data, FIELD)
-    estimate = campaign.newest or campaign.estimate(how)
+    estimate = session.newest or session.estimate(how)
     if isinstance(estimate, Estimate):
         paths.append(confined(folder, f"estimate_{name}.yaml"))
         write_estimate(paths[-1], estimate, FIELD)
@@ -411,20 +403,22 @@ def save(folder: str, campaign: Campaign, how: Matching, urdf: str = "") -> list
     return paths
 
 
-def report(folder: str, campaign: Campaign, how: Matching) -> Path:
+def report(folder: str, session: Session, how: Matching) -> Path:
     """Write ``report_PLAN.html``; returns its path.
 
     Raises:
         InputError: No folder was chosen, or it cannot be written to.
         NotEnoughDataError: There is no estimate yet.
     """
-    path = confined(folder, f"report_{plan_name(campaign.plan_id)}.html")
-    estimate = campaign.newest or campaign.estimate(how)
+    from calib_planner.report import InputFile, Provenance, write_report  # templates: a node starts without them
+
+    path = confined(folder, f"report_{plan_name(session.plan_id)}.html")
+    estimate = session.newest or session.estimate(how)
     if not isinstance(estimate, Estimate):
         raise NotEnoughDataError(0, 1, f"there is no estimate to report yet: {estimate.message}")
-    model = campaign.store.model
+    model = session.store.model
     inputs = (InputFile("robot", model.origin or model.name, model.sha256),)
-    write_report(path, campaign.problem(how), estimate, Provenance(inputs), FIELD)
+    write_report(path, session.problem(how), estimate, Provenance(inputs), FIELD)
     return path
 
 
@@ -437,7 +431,7 @@ def plan_name(plan_id: str) -> str:
 
 
 def confined(folder: str, name: str) -> Path:
-    """The path of a file in ``folder``, which is made if it is not there.
+    """The path of a file in ``folder``, which is made if it does not exist.
 
     Raises:
         InputError: No folder, or none that can be made; a name that leaves it, or is a link.

@@ -20,7 +20,7 @@ from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.io import config_folder
 from calib_planner.planning import CRITERIA
 from calib_planner.ros.lifecycle import LifecycleParameters
-from calib_planner.ros.parameters import constraints_text, described, parameter
+from calib_planner.ros.parameters import at_configure, constraints_text, described, parameter
 from calib_planner.simulation import Faults
 from calib_planner.units import cut
 
@@ -45,20 +45,12 @@ def unknown_words(text: str) -> list[str]:
 class RobotParameters(LifecycleParameters):
     """Which robot a node works for."""
 
-    robot: str = parameter(
-        "kuka_kr270", "name of a shipped robot; empty = wait for robot_description", at_configure=True
+    robot: str = at_configure("kuka_kr270", "name of a shipped robot; empty = wait for robot_description")
+    use_robot_description: bool = at_configure(
+        True, "a URDF on robot_description replaces robot (in the identifier until a measurement is accepted)"
     )
-    use_robot_description: bool = parameter(
-        True,
-        "a URDF on robot_description replaces robot (in the identifier until a measurement is accepted)",
-        at_configure=True,
-    )
-    base_link: str = parameter(
-        "", "first link of the chain in robot_description; empty = its root", at_configure=True
-    )
-    tip_link: str = parameter(
-        "", "last link of the chain in robot_description; empty = its only tip", at_configure=True
-    )
+    base_link: str = at_configure("", "first link of the chain in robot_description; empty = its root")
+    tip_link: str = at_configure("", "last link of the chain in robot_description; empty = its only tip")
 
 
 @dataclass(frozen=True)
@@ -98,7 +90,7 @@ class PlannerParameters(PlanParameters):
     most_configurations: int = parameter(200, "largest number of configurations in a request", "", 1, 10000)
     most_test_poses: int = parameter(1000, "largest number of test poses in a request", "", 1, 10000)
     most_candidates: int = parameter(2000, "largest number of candidates in a request", "", 1, 10000)
-    constraints: str = parameter("", CONSTRAINTS, at_configure=True)
+    constraints: str = at_configure("", CONSTRAINTS)
     joint_speed: float = parameter(0.5, "largest speed of turning joints on ~/trajectory", "rad/s", 1e-3, 100.0)
     slide_speed: float = parameter(0.1, "largest speed of sliding joints on ~/trajectory", "m/s", 1e-4, 100.0)
     dwell: float = parameter(5.0, "length of a standstill on ~/trajectory, per measurement", "s", 0.0, 3600.0)
@@ -108,8 +100,8 @@ class PlannerParameters(PlanParameters):
 class IdentifierParameters(StandstillSettings, RobotParameters):
     """Parameters of ``calibration_identifier``."""
 
-    parameters: str = parameter("", LEVEL + "; empty = those of the plan", at_configure=True)
-    unknown: str = parameter("", UNKNOWN, at_configure=True)
+    parameters: str = at_configure("", LEVEL + "; empty = those of the plan")
+    unknown: str = at_configure("", UNKNOWN)
     sigma: float = parameter(
         3e-5,
         "noise of one coordinate of one tracker point; 0 = estimated from the scatter of the points",
@@ -120,8 +112,8 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
     repeatability: float = parameter(
         0.0, "standard deviation that averaging does not reduce (robot, reflector)", "m", 0.0, 1.0
     )
-    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), TOPICS, at_configure=True)
-    plan_topic: str = parameter("calibration_planner/current_plan", "topic of the plan", at_configure=True)
+    tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
+    plan_topic: str = at_configure("calibration_planner/current_plan", "topic of the plan")
     plan_tolerance: float = parameter(
         0.01, "largest difference of a joint to the planned configuration", "rad or m", 1e-6, 1.0
     )
@@ -144,9 +136,7 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
         1e-3,
         60.0,
     )
-    diagnostics_period: float = parameter(
-        1.0, "time between two messages on /diagnostics", "s", 0.05, 3600.0, at_configure=True
-    )
+    diagnostics_period: float = at_configure(1.0, "time between two messages on /diagnostics", "s", 0.05, 3600.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -158,33 +148,24 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
 class SimulatorParameters(LifecycleParameters, Faults):
     """Parameters of ``tracker_simulator``."""
 
-    robot: str = parameter("kuka_kr270", "name of a shipped robot", at_configure=True)
-    parameters: str = parameter(
-        "lengths+offsets", "which parameters have true errors: a level or names", at_configure=True
-    )
-    seed: int = parameter(0, "seed of everything that is drawn", "", 0, LARGEST_SEED, at_configure=True)
-    length_error: float = parameter(
-        1e-3, "standard deviation of the true errors of lengths", "m", 0.0, 1.0, at_configure=True
-    )
-    angle_error: float = parameter(
-        1e-3, "standard deviation of the true errors of angles", "rad", 0.0, 1.0, at_configure=True
-    )
-    true_deviations: str = parameter(
-        "", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]", at_configure=True
-    )
-    sigma: float = parameter(3e-5, "noise of one coordinate of a tracker point", "m", 0.0, 1.0, at_configure=True)
-    instrument: str = parameter(
+    robot: str = at_configure("kuka_kr270", "name of a shipped robot")
+    parameters: str = at_configure("lengths+offsets", "which parameters have true errors: a level or names")
+    seed: int = at_configure(0, "seed of everything that is drawn", "", 0, LARGEST_SEED)
+    length_error: float = at_configure(1e-3, "standard deviation of the true errors of lengths", "m", 0.0, 1.0)
+    angle_error: float = at_configure(1e-3, "standard deviation of the true errors of angles", "rad", 0.0, 1.0)
+    true_deviations: str = at_configure("", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]")
+    sigma: float = at_configure(3e-5, "noise of one coordinate of a tracker point", "m", 0.0, 1.0)
+    instrument: str = at_configure(
         "sigma",
         "the tracker's noise: sigma for all coordinates, or that of a shipped instrument",
         choices=("sigma", *shipped_instruments()),
-        at_configure=True,
     )
-    joint_rate: float = parameter(100.0, "rate of joint_states", "Hz", 1.0, 1000.0, at_configure=True)
-    tracker_rate: float = parameter(50.0, "rate of tracker points", "Hz", 0.1, 1000.0, at_configure=True)
+    joint_rate: float = at_configure(100.0, "rate of joint_states", "Hz", 1.0, 1000.0)
+    tracker_rate: float = at_configure(50.0, "rate of tracker points", "Hz", 0.1, 1000.0)
     joint_speed: float = parameter(6.0, "largest joint speed", "rad/s", 1e-3, 100.0)
     dwell: float = parameter(0.8, "length of a standstill, per measurement", "s", 0.0, 600.0)
-    tracker_topics: tuple[str, ...] = parameter(("tracker/point",), TOPICS, at_configure=True)
-    frame_id: str = parameter("tracker", "name of the tracker's frame", at_configure=True)
+    tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
+    frame_id: str = at_configure("tracker", "name of the tracker's frame")
 
     def deviations(self, names: Sequence[str]) -> dict[str, float]:
         """``true_deviations`` by parameter name; refuses names not in ``names`` and values not finite."""
@@ -238,13 +219,9 @@ class CampaignParameters(PlanParameters):
         "folder of the campaign and its results, which a restart goes on with; empty = lost with the node",
         read_only=True,
     )
-    execute_action: str = parameter(
-        "tracker_simulator/execute_plan", "action ExecutePlan of the robot", at_configure=True
-    )
-    identifier: str = parameter(
-        "calibration_identifier",
-        "name of the identifier, whose parameter plan_topic names ~/plan of this node",
-        at_configure=True,
+    execute_action: str = at_configure("tracker_simulator/execute_plan", "action ExecutePlan of the robot")
+    identifier: str = at_configure(
+        "calibration_identifier", "name of the identifier, whose parameter plan_topic names ~/plan of this node"
     )
     dwell: float = parameter(
         0.0, "length of a standstill, per measurement; 0 = the robot's default", "s", 0.0, 600.0

@@ -23,7 +23,7 @@ from calib_planner import Estimate, Plan, Robot
 from calib_planner.acquisition import NANO, Rejection, RejectionReason, Standstill
 from calib_planner.errors import InputError, StoreError
 from calib_planner.io import NOT_STORED, CampaignStore, StoredModel, UnavailableStore, open_store
-from calib_planner.ros.session import MOST_REJECTIONS, Campaign, Matching, condition_of
+from calib_planner.ros.session import MOST_REJECTIONS, Matching, Session, condition_of
 from calib_planner.simulation import random_deviations
 
 HOW = Matching(sigma=3e-5)
@@ -43,8 +43,8 @@ def opened(folder: Path | str) -> CampaignStore:
     return open_store(str(folder), StoredModel(ROBOT.name, ROBOT.joint_names, 1, "text"), {}, "")
 
 
-def begun(store: CampaignStore, plan: Plan | None = PLAN) -> Campaign:
-    made = Campaign(ROBOT, LEVELS["same"], store)
+def begun(store: CampaignStore, plan: Plan | None = PLAN) -> Session:
+    made = Session(ROBOT, LEVELS["same"], store)
     if plan is not None:
         made.begin("p", plan, HOW.tolerance)
     return made
@@ -59,7 +59,7 @@ def seen(row: int, error: float = 0.0, attempt: int = 0, plan: Plan = PLAN) -> S
     return Standstill(start, start + NANO, q, point, np.full(1, 3e-5 / np.sqrt(20)), np.array([20]))
 
 
-def measure(campaign: Campaign, *founds: Standstill) -> list[str]:
+def measure(campaign: Session, *founds: Standstill) -> list[str]:
     """Statuses in the order told: of the standstills, and of what is seen otherwise after each."""
     told = []
     for found in founds:
@@ -85,11 +85,11 @@ def test_an_outlier_is_told_kept_and_measured_again() -> None:
     campaign = begun(opened(""))
     assert set(measure(campaign, *(seen(k) for k in range(8)))) == {"accepted"}
     assert measure(campaign, seen(8, 1e-3)) == ["accepted", "8 outlier"]
-    outlier = campaign.kept[-1]
+    outlier = campaign.records[-1]
     assert "standard deviations" in outlier.reason and outlier.unused == (0,)
     assert campaign.rejections == {"outlier": 1} and len(campaign.accepted) == 8
     assert 8 in campaign.missing() and campaign.done()[8] == 0
-    assert measure(campaign, seen(8)) == ["accepted"] and campaign.kept[-1].repetition == 0
+    assert measure(campaign, seen(8)) == ["accepted"] and campaign.records[-1].repetition == 0
     assert 8 not in campaign.missing()
     trail = [t["status"] for t in campaign.store.history(outlier.number)]
     assert trail == ["accepted", "outlier"]
@@ -110,8 +110,8 @@ def test_a_point_that_was_an_outlier_is_accepted_again() -> None:
     """A noise that was given too small makes outliers; with the right one they are none."""
     campaign = begun(opened(""))
     measure(campaign, *(seen(k) for k in range(8)), seen(8, 4e-4))
-    number = campaign.kept[-1].number
-    assert campaign.kept[-1].status == "outlier"
+    number = campaign.records[-1].number
+    assert campaign.records[-1].status == "outlier"
     campaign.estimate(replace(HOW, sigma=2e-3))
     (back,) = campaign.judge()
     assert (back.number, back.status, back.reason, back.unused) == (number, "accepted", "", ())
@@ -133,7 +133,7 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path) -> None:
     store = opened(tmp_path)
     campaign = begun(store)
     measure(campaign, *(seen(k, 1e-3 if k == 6 else 0.0) for k in range(9)))
-    withdrawn = campaign.undo(campaign.kept[2].number)
+    withdrawn = campaign.undo(campaign.records[2].number)
     assert withdrawn is not None and withdrawn.index == 2
     campaign.take(replace(seen(0), joints=PLAN.configurations[0] + 0.5), HOW)
     campaign.refuse(Rejection(1, 2, RejectionReason.MOVED, "moved", np.full(2, np.nan), np.array([3])))
@@ -144,8 +144,10 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path) -> None:
     store = opened(tmp_path)
     again = begun(store, None)
     assert (again.plan_id, again.missing(), again.rejections) == ("p", campaign.missing(), campaign.rejections)
-    told = [(d.number, d.status, d.reason, d.index, d.repetition, d.unused, d.frame) for d in campaign.kept]
-    assert told == [(d.number, d.status, d.reason, d.index, d.repetition, d.unused, d.frame) for d in again.kept]
+    told = [(d.number, d.status, d.reason, d.index, d.repetition, d.unused, d.frame) for d in campaign.records]
+    assert told == [
+        (d.number, d.status, d.reason, d.index, d.repetition, d.unused, d.frame) for d in again.records
+    ]
     assert_same_estimate(before, again.estimate(HOW))
     assert not again.judge() and not again.begin("p", PLAN, 0.01)
     store.close()
@@ -157,7 +159,7 @@ def test_the_way_does_not_matter() -> None:
     measure(straight, *(seen(k) for k in (0, 1, 2, 4, 6)))
     measure(detour, *(seen(k, 5e-3 if k == 3 else 0.0) for k in (0, 1, 2, 3, 4, 5, 6)))
     for row in (3, 5):
-        detour.undo(next(d.number for d in detour.kept if d.index == row))
+        detour.undo(next(d.number for d in detour.records if d.index == row))
     a, b = straight.estimate(HOW), detour.estimate(HOW)
     assert isinstance(a, Estimate) and isinstance(b, Estimate) and np.array_equal(a.fit.values, b.fit.values)
 
@@ -165,11 +167,11 @@ def test_the_way_does_not_matter() -> None:
 def test_a_plan_that_comes_back() -> None:
     campaign = begun(opened(""))
     measure(campaign, seen(0), seen(1))
-    assert campaign.begin("other", planned(4), 0.01) and not campaign.kept
-    assert campaign.begin("p", PLAN, 0.01) and [d.index for d in campaign.kept] == [0, 1]
+    assert campaign.begin("other", planned(4), 0.01) and not campaign.records
+    assert campaign.begin("p", PLAN, 0.01) and [d.index for d in campaign.records] == [0, 1]
     with pytest.raises(InputError, match="plan_id"):
         campaign.begin("p", planned(4), 0.01)
-    assert campaign.plan_id == "p" and len(campaign.kept) == 2
+    assert campaign.plan_id == "p" and len(campaign.records) == 2
 
 
 def test_a_new_plan_can_go_on_with_the_measurements() -> None:
@@ -178,20 +180,20 @@ def test_a_new_plan_can_go_on_with_the_measurements() -> None:
     before = campaign.newest
     rest = replace(PLAN, configurations=PLAN.configurations[[3, 4, 8]], repetitions=np.ones(3, int))
     assert campaign.begin("rest", rest, 0.01, keep=True)
-    assert [d.index for d in campaign.kept] == [None, None, None, 0, 1, None] and campaign.missing() == [2]
+    assert [d.index for d in campaign.records] == [None, None, None, 0, 1, None] and campaign.missing() == [2]
     assert_same_estimate(before, campaign.estimate(HOW))
     again = begun(campaign.store, None)
-    assert [d.index for d in again.kept] == [d.index for d in campaign.kept]
+    assert [d.index for d in again.records] == [d.index for d in campaign.records]
 
 
 def test_reset_leaves_the_old_campaign_in_the_store() -> None:
     campaign = begun(opened(""))
     measure(campaign, seen(0), seen(1))
-    number = campaign.kept[0].number
-    assert campaign.reset() == 2 and not campaign.kept and campaign.missing() == list(range(12))
+    number = campaign.records[0].number
+    assert campaign.reset() == 2 and not campaign.records and campaign.missing() == list(range(12))
     assert len(campaign.store.history(number)) == 1
     measure(campaign, seen(0))
-    assert [d.index for d in begun(campaign.store, None).kept] == [0]
+    assert [d.index for d in begun(campaign.store, None).records] == [0]
 
 
 def test_rejections_cannot_fill_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,17 +216,17 @@ def test_what_cannot_be_written_is_not_accepted() -> None:
     campaign.store._database.execute("PRAGMA query_only = ON")
     decision = campaign.take(seen(8), HOW)
     assert decision.status == NOT_STORED and decision.reason.startswith("not stored: ") and decision.number == 0
-    assert len(campaign.kept) == 8 and campaign.newest is before and campaign.store.trouble
+    assert len(campaign.records) == 8 and campaign.newest is before and campaign.store.trouble
     with pytest.raises(StoreError):
         campaign.undo()
     with pytest.raises(StoreError):
         campaign.reset()
-    assert len(campaign.kept) == 8 and campaign.begin("second", planned(4), 0.01)
+    assert len(campaign.records) == 8 and campaign.begin("second", planned(4), 0.01)
     assert campaign.take(seen(8, plan=PLAN), HOW).status == "not_in_plan"
     campaign.store._database.execute("PRAGMA query_only = OFF")
     assert measure(campaign, seen(0, plan=planned(4))) == ["accepted"] and not campaign.store.trouble
     again = begun(campaign.store, None)
-    assert again.plan_id == "second" and len(again.kept) == 1
+    assert again.plan_id == "second" and len(again.records) == 1
 
 
 def test_what_is_seen_otherwise_is_written_when_that_is_possible() -> None:
@@ -263,7 +265,7 @@ def campaign_to_its_end(folder: Path, out: Connection) -> None:
     campaign = begun(opened(folder))
     campaign.estimate(HOW)
     campaign.judge()
-    say("open", *sorted(d.number for d in campaign.kept))
+    say("open", *sorted(d.number for d in campaign.records))
     for attempt, row in schedule(campaign):
         if attempt == "undo":
             undone = campaign.undo(row)
@@ -273,12 +275,12 @@ def campaign_to_its_end(folder: Path, out: Connection) -> None:
             campaign.judge()
             continue
         for word in measure(campaign, seen(row, 2e-3 if row == 5 and attempt == 0 else 0.0, attempt)):
-            say(word, campaign.kept[-1].number)
+            say(word, campaign.records[-1].number)
     say("complete")
     time.sleep(600.0)
 
 
-def schedule(campaign: Campaign) -> list[tuple[object, int]]:
+def schedule(campaign: Session) -> list[tuple[object, int]]:
     """What is still to be done: rows 0 to 11, where 5 goes wrong first and 7 is withdrawn and measured again."""
     done = {(d.index, d.acquired.start, tuple(d.acquired.points.ravel())) for d in everything(campaign)}  # type: ignore[union-attr]
     steps: list[tuple[object, int]] = []
@@ -288,16 +290,16 @@ def schedule(campaign: Campaign) -> list[tuple[object, int]]:
             steps.append((0, row))
     if steps:
         return steps
-    seven = [d for d in campaign.kept if d.index == 7]
+    seven = [d for d in campaign.records if d.index == 7]
     again = {(row, tuple(seen(row, 0.0, 1).points.ravel())) for row in (5, 7)}
     for d in seven:
         if tuple(d.standstill.points.ravel()) == tuple(seen(7).points.ravel()):
             steps.append(("undo", d.number))
-    have = {(d.index, tuple(d.standstill.points.ravel())) for d in campaign.kept}
+    have = {(d.index, tuple(d.standstill.points.ravel())) for d in campaign.records}
     return steps + [(1, row) for row, points in sorted(again) if (row, points) not in have]
 
 
-def everything(campaign: Campaign) -> list[object]:
+def everything(campaign: Session) -> list[object]:
     found = campaign.store.current()
     assert found is not None
     return [d for d in found.records if isinstance(d.acquired, Standstill)]
@@ -324,7 +326,7 @@ def final(folder: Path) -> tuple[list[tuple[object, ...]], object]:
     estimate = campaign.estimate(HOW)
     campaign.judge()
     store.close()
-    return [(d.index, d.status, tuple(d.standstill.points.ravel())) for d in campaign.kept], estimate
+    return [(d.index, d.status, tuple(d.standstill.points.ravel())) for d in campaign.records], estimate
 
 
 def finish(folder: Path) -> None:

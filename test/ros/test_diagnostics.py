@@ -17,13 +17,13 @@ from calib_planner.errors import InputError, StoreError
 from calib_planner.io import StoredModel, UnavailableStore
 from calib_planner.ros.diagnostics import StreamHealth, diagnostics, health
 from calib_planner.ros.messages import joints_message, point_message, stamp_message
-from calib_planner.ros.session import Campaign
+from calib_planner.ros.session import Session
 
 GOOD = StreamHealth("joint_states", 1000.0, 0.002, 0.0, 5000, 0, 0, 0, "")
 POINT = replace(GOOD, name="tracker/point", skew=0.001, offset=Offset(0.004, 0.001, 9))
 
 
-def said(campaign: Campaign | None, *streams: StreamHealth) -> dict[str, DiagnosticStatus]:
+def said(campaign: Session | None, *streams: StreamHealth) -> dict[str, DiagnosticStatus]:
     message = diagnostics("identifier", 7 * NANO, streams or (GOOD, POINT), 0.1, campaign, "no robot yet")
     assert message.header.stamp.sec == 7
     found = {s.name.removeprefix("identifier: "): s for s in message.status}
@@ -56,7 +56,7 @@ def test_a_good_campaign() -> None:
 
 
 def test_before_anything_was_measured() -> None:
-    found = said(Campaign(ROBOT, lambda _: ROBOT, opened("")))
+    found = said(Session(ROBOT, lambda _: ROBOT, opened("")))
     assert found["campaign"].level == DiagnosticStatus.WARN and "no plan" in found["campaign"].message
     assert found["estimate"].level == DiagnosticStatus.OK and not found["estimate"].values
     nothing = said(None)

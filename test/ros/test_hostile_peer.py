@@ -269,13 +269,13 @@ def urdfs(secret: Path) -> dict[str, str]:
 @pytest.mark.parametrize("case", urdfs(Path("x")))
 def test_descriptions(cell: Cell, case: str) -> None:
     text = urdfs(cell.outside / "secret.txt")[case]
-    before = cell.planner._source.model, cell.identifier._campaign
+    before = cell.planner._source.model, cell.identifier._session
     said = [
         cell.refused(node, lambda: cell.descriptions.publish(String(data=text)), "refused")
         for node in (cell.planner, cell.identifier)
     ]
     assert all("0123" not in words for words in said)
-    assert cell.identifier._campaign is before[1] and cell.planner._source.model is before[0]
+    assert cell.identifier._session is before[1] and cell.planner._source.model is before[0]
     answer = cell.ask(robot="planar_2r")
     assert answer.status == PlanService.Response.SUCCESS
 

@@ -80,7 +80,7 @@ def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
         assert shift.rest(q).status == Measurement.ACCEPTED
     bench.wait(lambda: shift.estimates[-1].complete)
     q = random_configurations(robot, 5, 1)
-    wanted = shift.node._campaign.newest.calibrated.positions(q)
+    wanted = shift.node._session.newest.calibrated.positions(q)
 
     def published() -> bool:
         """The description comes after the estimate."""
@@ -93,11 +93,11 @@ def test_a_robot_that_is_described(bench: Bench, tmp_path: Path) -> None:
 
     descriptions.publish(String(data=ARM.replace("0.5 0 0", "0.6 0 0")))
     bench.wait(lambda: "refused" in shift.node._waiting)
-    assert shift.node._campaign.nominal.name == "arm" and len(shift.node._campaign.kept) == 12
+    assert shift.node._session.nominal.name == "arm" and len(shift.node._session.records) == 12
     change(bench, "deactivate")
     change(bench, "cleanup")
     again = bench.start(IdentifierNode, robot="", store_folder=str(tmp_path))
-    assert again._campaign.nominal.joint_names == robot.joint_names and len(again._campaign.kept) == 12
+    assert again._session.nominal.joint_names == robot.joint_names and len(again._session.records) == 12
 
 
 @pytest.mark.parametrize("text", ["", "<robot", "<!DOCTYPE a [<!ENTITY b 'c'>]><robot/>", "x" * 5_000_000])

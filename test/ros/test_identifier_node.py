@@ -174,7 +174,7 @@ def test_messages_without_a_stamp_are_refused_with_a_reason(shift: Shift, planne
 
 def test_what_cannot_be_stored_is_not_accepted(shift: Shift, planned: Plan) -> None:
     shift.announce(planned)
-    database = shift.node._campaign.store._database
+    database = shift.node._session.store._database
     database.execute("PRAGMA query_only = ON")
     refused = shift.rest(planned.configurations[0])
     assert refused.status == Measurement.REJECTED_NOT_STORED and refused.reason.startswith("not stored: ")
@@ -237,7 +237,7 @@ def test_a_folder_that_cannot_be_opened_yet(bench: Bench, robot: Robot, planned:
     shift.announce(planned)
     assert shift.rest(planned.configurations[0]).status == Measurement.REJECTED_NOT_STORED
     (tmp_path / "blocked").unlink()
-    bench.wait(lambda: (c := shift.node._campaign) is not None and not c.store.trouble)
+    bench.wait(lambda: (c := shift.node._session) is not None and not c.store.trouble)
     assert (tmp_path / "blocked" / FILE).exists()
     assert shift.rest(planned.configurations[0]).status == Measurement.ACCEPTED
     assert shift.estimates[-1].plan_id == "p"
@@ -246,7 +246,7 @@ def test_a_folder_that_cannot_be_opened_yet(bench: Bench, robot: Robot, planned:
 def test_two_targets(bench: Bench) -> None:
     robot = Robot.load("planar_2r").with_targets(np.zeros((2, 3))).with_parameters("lengths+offsets", ["tool"])
     bench.start(IdentifierNode, robot="planar_2r", unknown="tool", tracker_topics=["a", "b"])
-    assert len(robot.targets) == 2 and len(bench.nodes[0]._campaign.robot.targets) == 2
+    assert len(robot.targets) == 2 and len(bench.nodes[0]._session.robot.targets) == 2
     assert {w.name for w in bench.nodes[0]._intake.streams} == {"joint_states", "a", "b"}
 
 

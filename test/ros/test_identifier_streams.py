@@ -60,8 +60,8 @@ def test_what_was_withdrawn_stays_withdrawn(bench: Bench, robot: Robot, planned:
     bench.wait(lambda: {m.status for m in last_told(shift).values()} == {CLOCK})
     for transition in ("deactivate", "cleanup", "configure", "activate"):
         change(bench, transition)
-    assert shift.node._campaign.kept == []
-    assert shift.node._campaign.rejections["clock_offset"] == 5
+    assert shift.node._session.records == []
+    assert shift.node._session.rejections["clock_offset"] == 5
 
 
 def test_points_in_another_frame_are_refused_with_the_reason(
@@ -131,7 +131,7 @@ def test_an_inactive_identifier_does_not_seem_to_take_plans(bench: Bench, robot:
     shift.plans.publish(plan_to_message(planned, "other", 0, "base"))
     node = shift.node
     assert isinstance(node, IdentifierNode)
-    bench.wait(lambda: node._campaign.plan_id == "other")
+    bench.wait(lambda: node._session.plan_id == "other")
     assert len(shift.estimates) == count
     change(bench, "activate")
     bench.wait(lambda: shift.estimates[-1].plan_id == "other")

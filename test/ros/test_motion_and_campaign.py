@@ -14,7 +14,7 @@ from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameErro
 from calib_planner.io import CampaignStore, StoredModel, open_store
 from calib_planner.planning import Search
 from calib_planner.ros import session as saving
-from calib_planner.ros.session import Campaign, Matching, TooFew
+from calib_planner.ros.session import Matching, Session, TooFew
 from calib_planner.simulation import SimulatedCell, make_tour, random_deviations
 
 LIMITS = np.array([[-3.0, 3.0], [-3.0, 3.0]])
@@ -52,8 +52,8 @@ def planned(robot: Robot) -> Plan:
 
 
 @pytest.fixture
-def campaign(robot: Robot, planned: Plan) -> Campaign:
-    made = Campaign(robot, lambda _: robot, memory(robot))
+def campaign(robot: Robot, planned: Plan) -> Session:
+    made = Session(robot, lambda _: robot, memory(robot))
     assert made.begin("p", planned, HOW.tolerance)
     return made
 
@@ -68,7 +68,7 @@ def standstill(robot: Robot, q: np.ndarray, seed: int = 0) -> Standstill:
     return Standstill(0, 10**9, q, points, np.full(1, 1e-5), np.array([20]))
 
 
-def test_from_too_few_to_complete(robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_from_too_few_to_complete(robot: Robot, planned: Plan, campaign: Session) -> None:
     first = campaign.estimate(HOW)
     assert isinstance(first, TooFew) and first.missing == 2
     for i, q in enumerate(planned.configurations):
@@ -82,7 +82,7 @@ def test_from_too_few_to_complete(robot: Robot, planned: Plan, campaign: Campaig
     assert (again.index, again.repetition) == (2, 1)
 
 
-def test_far_from_the_plan(robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_far_from_the_plan(robot: Robot, planned: Plan, campaign: Session) -> None:
     odd = standstill(robot, planned.configurations[0] + 0.02)
     decision = campaign.take(odd, HOW)
     assert decision.status == "not_in_plan" and "nearest planned configuration" in decision.reason
@@ -91,12 +91,12 @@ def test_far_from_the_plan(robot: Robot, planned: Plan, campaign: Campaign) -> N
 
 
 def test_without_a_plan(robot: Robot) -> None:
-    campaign = Campaign(robot, lambda _: robot, memory(robot))
+    campaign = Session(robot, lambda _: robot, memory(robot))
     decision = campaign.take(standstill(robot, np.zeros(2)), HOW)
     assert decision.status == "not_in_plan" and "no plan" in decision.reason
 
 
-def test_undo_and_reset(robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_undo_and_reset(robot: Robot, planned: Plan, campaign: Session) -> None:
     assert campaign.undo() is None
     for i in range(2):
         campaign.take(standstill(robot, planned.configurations[i]), HOW)
@@ -105,7 +105,7 @@ def test_undo_and_reset(robot: Robot, planned: Plan, campaign: Campaign) -> None
     assert campaign.reset() == 1 and not campaign.accepted
 
 
-def test_plans_for_others_are_refused(robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_plans_for_others_are_refused(robot: Robot, planned: Plan, campaign: Session) -> None:
     campaign.take(standstill(robot, planned.configurations[0]), HOW)
     with pytest.raises(UnknownNameError):
         campaign.begin("q", replace(planned, robot="other"), 0.01)
@@ -115,7 +115,7 @@ def test_plans_for_others_are_refused(robot: Robot, planned: Plan, campaign: Cam
     assert campaign.begin("q", planned, 0.01) and not campaign.accepted
 
 
-def test_memory_is_bounded(robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_memory_is_bounded(robot: Robot, planned: Plan, campaign: Session) -> None:
     how = replace(HOW, most=2)
     statuses = [campaign.take(standstill(robot, planned.configurations[0]), how).status for _ in range(4)]
     assert statuses == ["accepted", "accepted", "not_in_plan", "not_in_plan"]
@@ -126,7 +126,7 @@ def test_memory_is_bounded(robot: Robot, planned: Plan, campaign: Campaign) -> N
     [(3e-5, 0.0, 3e-5 / 20**0.5), (3e-5, 1e-4, 1.0022e-4), (0.0, 0.0, 1e-5)],
 )
 def test_weights(
-    robot: Robot, planned: Plan, campaign: Campaign, sigma: float, repeatability: float, expected: float
+    robot: Robot, planned: Plan, campaign: Session, sigma: float, repeatability: float, expected: float
 ) -> None:
     how = replace(HOW, sigma=sigma, repeatability=repeatability)
     campaign.take(standstill(robot, planned.configurations[0]), how)
@@ -134,7 +134,7 @@ def test_weights(
     assert data is not None and np.allclose(np.asarray(data.std), expected, rtol=1e-3)
 
 
-def test_save(tmp_path, robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_save(tmp_path, robot: Robot, planned: Plan, campaign: Session) -> None:
     with pytest.raises(InputError, match="save_folder"):
         saving.save("", campaign, HOW)
     with pytest.raises(NotEnoughDataError):
@@ -151,7 +151,7 @@ def test_save(tmp_path, robot: Robot, planned: Plan, campaign: Campaign) -> None
         saving.save(str(tmp_path / "file"), campaign, HOW)
 
 
-def test_a_simulated_shift_gives_the_truth(robot: Robot, planned: Plan, campaign: Campaign) -> None:
+def test_a_simulated_shift_gives_the_truth(robot: Robot, planned: Plan, campaign: Session) -> None:
     """Motion, tracker, standstills and identification together, without ROS: within 4 std, all of them."""
     truth = random_deviations(robot, 5)
     true_robot = robot.with_deviations(truth)

@@ -1,13 +1,14 @@
-"""Node ``calibration_campaign``: measures until it is accurate enough, with the robot and identifier there are.
+"""Node ``calibration_campaign``: measures, with the robot and the identifier, until the estimate is accurate
+enough.
 
-What is done next is said by ``adaptive`` (a pure state machine); plans are made by the library in a thread of
-their own. This file carries it out: it tells the identifier the plan (latched ``~/plan``, the identifier's
-``plan_topic``), has the robot sent to one configuration at a time (``campaign_measuring``), and hears what was
-accepted. The identifier is to keep measurements over plans (``keep_measurements``): every plan of the fit holds
-all that was measured before. The validation's holds the validation only, and after it the fit's plan is told
-again, so that in the end the identifier's own estimate, too, is that of the fit.
+The library's ``campaign`` says what is to be done next (a pure state machine); plans are made by the library in a
+thread of their own. This file carries it out: ``Measuring`` tells the identifier the plan (latched ``~/plan``,
+the identifier's ``plan_topic``), sends the robot to one configuration at a time, and listens to what was
+accepted. The identifier has to keep its measurements when a plan comes (``keep_measurements``): every plan of the
+fit holds everything that was measured before. The plan of the validation holds the validation only; after it the
+plan of the fit is announced again, so that in the end the identifier's own estimate, too, is that of the fit.
 
-Nothing is sent anywhere before ``~/start``, nor after a restart before ``~/resume``. All callbacks take turns in
+The robot is sent nowhere before ``~/start``, nor after a restart before ``~/resume``. All callbacks take turns in
 one thread.
 """
 
@@ -21,12 +22,9 @@ from functools import partial
 
 from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from calib_planner.campaign import (
     CampaignResult,
@@ -44,13 +42,12 @@ from calib_planner.ros.campaign import (
     Measuring,
     idle_status,
     problem_of,
-    reasons_of,
     result_message,
     status_message,
     write_result,
 )
-from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.lifecycle import ManagedNode, reason_of
+from calib_planner.ros.messages import reasons_of, stamp_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
@@ -60,20 +57,20 @@ from calib_planner.units import cut
 PERIOD = 0.05
 """Time between two looks at what there is to do [s]."""
 PATIENCE = 4.0
-"""Time that a plan gets to end when it is stopped [s]."""
+"""Time that the search of a plan has to end when it is stopped [s]."""
 
 
 class CampaignNode(ManagedNode[CampaignParameters]):
-    """See the module.
+    """The campaign as a node.
 
     Attributes:
-        campaign: The state of the campaign, ``None`` before the first.
+        campaign: The state of the campaign; ``None`` before the first.
     """
 
     THREADS = 1
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        self._stop = threading.Event()
+        self._ending_plan = threading.Event()
         self._work: Future[NextStep] | None = None
         self._work_for = ""
         self._forget()
@@ -84,8 +81,6 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._journal: Journal | None = None
         self._id, self._reason, self._sent = "", "call ~/start", ""
         self._reported = False
-
-    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
 
     def configure(self) -> None:
         """Load the robot, offer services, listen."""
@@ -101,23 +96,22 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self.create_subscription(Measurement, f"{name}/measurements", self._on_measurement, EVENTS)
         self.create_subscription(CalibrationEstimate, f"{name}/estimate", self._on_estimate, LATCHED)
         for name in ("start", "pause", "resume", "skip"):
-            self.create_service(Trigger, f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
+            self.create_trigger(f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
 
     def activate(self) -> None:
-        """Look after the campaign; one in the store goes on when it is told to."""
-        self._stop.clear()
-        self._pool = ThreadPoolExecutor(1, "campaign")
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
-        self.create_timer(PERIOD, self._tick, clock=steady)
+        """Go on with the campaign; one in the store waits for ``~/resume``."""
+        self._ending_plan.clear()
+        self._thread = ThreadPoolExecutor(1, "campaign")
+        self.create_steady_timer(PERIOD, self._tick)
         self._go_on_with_stored()
         self.get_logger().info(self._reason)
         self._publish_status()
 
     def deactivate(self) -> None:
-        """Stop the robot and the plan that is being made; measurements stay."""
+        """Stop the robot and the search of a plan; measurements stay."""
         self._measuring.leave()
-        self._stop.set()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._ending_plan.set()
+        self._thread.shutdown(wait=False, cancel_futures=True)
         if self._work is not None and self._work in wait([self._work], PATIENCE).done:
             self._work = None
 
@@ -126,12 +120,12 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._forget()
 
     def close(self) -> bool:
-        """End everything; whether the plan that was being made ended in time."""
+        """End everything; returns whether the search of a plan ended in time."""
         super().close()
         return self._work is None
 
     def _go_on_with_stored(self) -> None:
-        """The campaign of the journal, paused: nobody shall be surprised by a robot that moves."""
+        """Load the campaign of the journal, paused, so that no robot moves unexpectedly."""
         chosen, model = self.settings.value, self._source.model
         if self.campaign is not None or not chosen.store_folder or not isinstance(model, Model):
             return
@@ -151,19 +145,11 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._measuring.begin(self._id)
         self._reason = f"{len(stored.rows)} measurements of campaign {self._id} are there: call ~/resume to go on"
 
-    # ── services ─────────────────────────────────────────────────────────────────────────────────────
-
-    def _serve(
-        self, action: Callable[[], str], _: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _serve(self, action: Callable[[], str]) -> str:
         try:
-            if not self.is_active:
-                raise InputError("node", self.state, "active", "activate it")
-            response.message, response.success = action(), True
-        except CalibPlannerError as error:
-            response.message, response.success = cut(error), False
-        self._publish_status()
-        return response
+            return action()
+        finally:
+            self._publish_status()
 
     def _start(self) -> str:
         before = self.campaign
@@ -181,8 +167,8 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._id, self._journal, self.campaign = name, journal, begin(problem)
         self._measuring.begin(name)
         self._reason = ""
-        kept = f"kept in {folder}" if folder else "in memory only: set store_folder to keep it"
-        return f"campaign {name} of {problem.robot.name} begun, {kept}"
+        where = f"stored in {folder}" if folder else "in memory only: set store_folder to store it"
+        return f"campaign {name} of {problem.robot.name} begun, {where}"
 
     def _pause(self) -> str:
         self._set(self._running("pause").pause())
@@ -211,8 +197,6 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             raise InputError(what, "no campaign under way", "one", "call ~/start")
         return self.campaign
 
-    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
-
     def _on_description(self, message: String) -> None:
         try:
             model = self._source.take(message.data)
@@ -236,10 +220,8 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         except InputError as error:
             self.get_logger().warning(f"measurement refused: {cut(error, 500)}", throttle_duration_sec=1.0)
 
-    # ── the campaign goes on ─────────────────────────────────────────────────────────────────────────
-
     def _set(self, state: CampaignState) -> None:
-        """A new state, on the disk before it is in force."""
+        """Take a new state; it is on the disk before it counts."""
         before = self.campaign
         if before is state:
             return
@@ -249,12 +231,12 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             except StoreError as error:
                 self._journal = None
                 state = state.pause()
-                self._reason = f"paused: not kept on disk any more, {error}; ~/resume goes on without"
+                self._reason = f"paused: not stored any more, {error}; ~/resume goes on without storing"
                 self.get_logger().error(self._reason)
         self.campaign = state
 
     def _tick(self) -> None:
-        self._take_decision()
+        self._take_step()
         state = self.campaign
         if state is not None:
             self._go_on(state)
@@ -271,24 +253,21 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         if isinstance(action, Finished):
             self._finish(action.result)
         elif not isinstance(action, Paused) and self._work is None:
-            self._work, self._work_for = self._pool.submit(decide, state, self._stop.is_set), self._id
+            self._work, self._work_for = self._thread.submit(decide, state, self._ending_plan.is_set), self._id
 
-    def _take_decision(self) -> None:
+    def _take_step(self) -> None:
         if self._work is None or not self._work.done() or self.campaign is None:
             return
         work, self._work = self._work, None
         if self._work_for != self._id:
             return  # of a campaign that was left
         try:
-            decision = work.result()
-        except CalibPlannerError as error:
-            self._pause_for(str(error))
-            return
+            step = work.result()
         except Exception as error:
-            self._pause_for(f"{type(error).__name__}: {error}")
+            self._pause_for(reason_of(error))
             return
-        self._set(self.campaign.decided(decision))
-        self.get_logger().info(f"round {len(self.campaign.rounds)}: {decision.message}")
+        self._set(self.campaign.decided(step))
+        self.get_logger().info(f"round {len(self.campaign.rounds)}: {step.message}")
 
     def _pause_for(self, reason: str) -> None:
         self._reason = f"paused: {cut(reason, 800)}"
@@ -297,7 +276,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             self._set(self.campaign.pause())
 
     def _finish(self, result: CampaignResult) -> None:
-        """Tell the result, once; the identifier goes back to the fit."""
+        """Publish and write the result, once; the identifier goes back to the fit."""
         if self._reported:
             return
         self._reported = True
@@ -306,7 +285,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             self.get_logger().info(reason)
         message = result_message(result, self._id)
         if message is not None:
-            message.header.stamp = stamp_message(self.get_clock().now().nanoseconds)
+            message.header.stamp = stamp_message(self.now)
             self._estimates.publish(message)
         self._measuring.back_to_fit()
         folder = self.settings.value.store_folder
@@ -319,7 +298,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
                 self.get_logger().error(self._reason)
 
     def _publish_status(self) -> None:
-        """If it is another than before."""
+        """Publish the status if it has changed."""
         if self.campaign is None:
             message = idle_status(self._reason)
         else:
@@ -327,7 +306,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         text = repr(message)
         if text != self._sent:
             self._sent = text
-            message.header.stamp = stamp_message(self.get_clock().now().nanoseconds)
+            message.header.stamp = stamp_message(self.now)
             self._status.publish(message)
 
 

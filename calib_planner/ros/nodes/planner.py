@@ -1,25 +1,22 @@
-"""Node ``calibration_planner``: plans on request (service and action) and publishes the newest plan.
+"""Node ``calibration_planner``: makes plans on request (service and action) and publishes the newest plan.
 
-What is decided is in ``planning``, which robot it is for in ``model_source``; this file only carries messages.
-Planning runs in a thread of the executor's pool beside all others, one request at a time: a second one is told
-BUSY. A thread is enough: under a search that fills a core, a parameter is answered in some milliseconds,
-because NumPy gives the interpreter away many times per millisecond.
+How a request is answered is in ``planning``, for which robot in ``model``; this file carries the messages. A plan
+is made in one of the executor's threads, one request at a time: a second one is answered BUSY. A thread is
+enough: while a search fills a core, a request for a parameter is answered within milliseconds, because NumPy
+releases the interpreter many times per millisecond.
 """
 
 from __future__ import annotations
 
 import math
-import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from calib_planner_msgs.action import PlanCalibration as PlanAction
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration as PlanService
-from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.context import Context
@@ -30,7 +27,7 @@ from visualization_msgs.msg import MarkerArray
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.planning import Progress
-from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.markers import plan_markers
 from calib_planner.ros.messages import pace_of, plan_to_message, trajectory_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
@@ -38,7 +35,6 @@ from calib_planner.ros.planning import Answer, answer, constraints_of
 from calib_planner.ros.qos import LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PlannerParameters
-from calib_planner.units import cut
 
 FEEDBACK_PERIOD = 0.1
 """Shortest time between two feedback messages [s]."""
@@ -47,15 +43,13 @@ PATIENCE = 4.0
 
 
 class PlannerNode(ManagedNode[PlannerParameters]):
-    """See the module."""
+    """The planner as a node."""
 
     THREADS = 4
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        self._busy, self._closing = threading.Lock(), threading.Event()
+        self._work = OneAtATime()
         super().__init__("calibration_planner", PlannerParameters(), context, overrides)
-
-    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
 
     def configure(self) -> None:
         """Load the robot, listen for another one, offer planning."""
@@ -71,35 +65,26 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         if chosen.use_robot_description:
             alone = MutuallyExclusiveCallbackGroup()
             self.create_subscription(String, TOPIC, self._on_description, LATCHED, callback_group=alone)
-        group = ReentrantCallbackGroup()
-        self.create_service(PlanService, "~/request_plan", self._on_request, callback_group=group)
-        self.create_action_server(
-            PlanAction,
-            "~/plan",
-            self._on_goal,
-            callback_group=group,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        self.create_service(
+            PlanService, "~/request_plan", self._on_request, callback_group=ReentrantCallbackGroup()
         )
+        self.create_action_server(PlanAction, "~/plan", self._on_goal)
 
     def activate(self) -> None:
         """Answer requests."""
-        self._closing.clear()
+        self._work.closing.clear()
         model = self._source.model
         ready = f"ready to plan for {model.robot.name}" if isinstance(model, Model) else str(model)
         self.get_logger().info(ready)
 
     def deactivate(self) -> None:
         """End a search that is under way."""
-        self._closing.set()
-        if self._busy.acquire(timeout=PATIENCE):
-            self._busy.release()
+        self._work.end(PATIENCE)
 
     def close(self) -> bool:
-        """End everything; whether a search ended in time."""
+        """End everything; returns whether a search ended in time."""
         super().close()
-        return not self._busy.locked()
-
-    # ── what comes in ────────────────────────────────────────────────────────────────────────────────
+        return self._work.ended
 
     def _on_description(self, message: String) -> None:
         try:
@@ -112,21 +97,21 @@ class PlannerNode(ManagedNode[PlannerParameters]):
             self.get_logger().info(f"{TOPIC}: {model.robot.name}, joints {joints}")
 
     def _on_request(self, request: PlanService.Request, response: PlanService.Response) -> PlanService.Response:
-        with self._turn() as mine:
-            return self._fill(response, self._work(mine, request, lambda _: self._closing.is_set()))
+        with self._work.turn() as mine:
+            return self._fill(response, self._answer(mine, request, lambda _: self._work.closing.is_set()))
 
     def _on_goal(self, goal: ServerGoalHandle) -> PlanAction.Result:
         last = -math.inf
 
         def progress(state: Progress) -> bool:
             nonlocal last
-            if state.seconds - last >= FEEDBACK_PERIOD and not self._closing.is_set():
+            if state.seconds - last >= FEEDBACK_PERIOD and not self._work.closing.is_set():
                 last = state.seconds
                 goal.publish_feedback(feedback_message(state))
-            return goal.is_cancel_requested or self._closing.is_set()
+            return goal.is_cancel_requested or self._work.closing.is_set()
 
-        with self._turn() as mine:
-            result = self._work(mine, goal.request, progress)
+        with self._work.turn() as mine:
+            result = self._answer(mine, goal.request, progress)
             response = self._fill(PlanAction.Result(), result)
             if self.context.ok():
                 if goal.is_cancel_requested:
@@ -137,19 +122,7 @@ class PlannerNode(ManagedNode[PlannerParameters]):
                     goal.abort()
         return response
 
-    # ── planning ─────────────────────────────────────────────────────────────────────────────────────
-
-    @contextmanager
-    def _turn(self) -> Iterator[bool]:
-        """Whether it is the request's turn: one at a time, to the end of its answer."""
-        mine = self._busy.acquire(blocking=False)
-        try:
-            yield mine
-        finally:
-            if mine:
-                self._busy.release()
-
-    def _work(
+    def _answer(
         self,
         mine: bool,
         request: PlanService.Request | PlanAction.Goal,
@@ -166,7 +139,7 @@ class PlannerNode(ManagedNode[PlannerParameters]):
             if result.plan is not None and self._source.refusal and not request.robot:
                 result = replace(result, message=f"{result.message}; {self._source.refusal}")
         except Exception as error:
-            result = Answer("INTERNAL_ERROR", "", f"{type(error).__name__}: {cut(error)}")
+            result = Answer("INTERNAL_ERROR", "", reason_of(error))
         if self.context.ok():
             text = f"{result.status} after {time.perf_counter() - began:.2f} s: {result.message}"
             if result.status == "INTERNAL_ERROR":
@@ -179,39 +152,39 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         self, response: PlanService.Response | PlanAction.Result, result: Answer
     ) -> PlanService.Response | PlanAction.Result:
         """Put the answer into a response, and publish its plan."""
-        if not hasattr(type(response), result.status):  # the service has no cancel: the node itself stopped
+        if not hasattr(type(response), result.status):  # a service cannot be cancelled: the node was deactivated
             result = Answer("NOT_READY", "", "the node was deactivated while it planned: activate it, ask again")
         response.status = getattr(type(response), result.status)
         response.field, response.message = result.field, result.message
         if result.plan is None or result.model is None:
             response.plan = PlanMessage(status=PlanMessage.STATUS_EMPTY)
         else:
-            settings, stamp = self.settings.value, self.get_clock().now().nanoseconds
+            settings, stamp = self.settings.value, self.now
             response.plan = plan_to_message(result.plan, uuid.uuid4().hex[:12], stamp, settings.frame_id)
-            if not self._closing.is_set():
+            if not self._work.closing.is_set():
                 self._publish(response.plan, result, stamp)
         return response
 
     def _publish(self, message: PlanMessage, result: Answer, stamp: int) -> None:
-        """The plan; how to drive it and how it looks follow, since whoever asked need not wait for them."""
+        """Publish the plan; the trajectory and the markers follow, since the client need not wait for them."""
         self._publishers_of[0].publish(message)
         if self.executor is not None:
             self.executor.create_task(self._safe(self._publish_more), result, stamp)
 
     def _publish_more(self, result: Answer, stamp: int) -> None:
         assert result.plan is not None and result.model is not None
-        found, robot, settings = result.plan, result.model.robot, self.settings.value
+        made, robot, settings = result.plan, result.model.robot, self.settings.value
         _, trajectories, pictures = self._publishers_of
         pace = pace_of(robot, settings.joint_speed, settings.slide_speed, result.model.speeds, settings.dwell)
         try:
-            trajectories.publish(trajectory_message(found, robot, pace, stamp, settings.frame_id))
+            trajectories.publish(trajectory_message(made, robot, pace, stamp, settings.frame_id))
         except CalibPlannerError as error:
             self.get_logger().error(f"no ~/trajectory: {error}")
-        pictures.publish(plan_markers(found, robot, stamp, settings.frame_id))
+        pictures.publish(plan_markers(made, robot, stamp, settings.frame_id))
 
 
 def feedback_message(state: Progress) -> PlanAction.Feedback:
-    """Progress as feedback; what is not known yet is NaN."""
+    """Progress as feedback; NaN stands for what is not known yet."""
     best = state.best_accuracy if math.isfinite(state.best_accuracy) else math.nan
     bound = state.lower_bound or math.nan
     return PlanAction.Feedback(

@@ -1,31 +1,30 @@
-"""Node ``tracker_simulator``: a robot with hidden true errors and a tracker that watches it.
+"""Node ``tracker_simulator``: a robot with hidden true errors, and a tracker that watches it.
 
 It publishes joint states (what the controller believes) and tracker points (where the true robot is seen), and
-executes plans as a real robot's node does (see docs/connecting.md). What the messages hold, and what goes wrong
-with them, is in ``simulation``: every tick asks there for what has arrived by now. A tick that comes late makes
-up for what it missed, so that a busy machine delays messages and loses none. The truth is never published.
+executes plans as the node of a real robot does (see docs/connecting.md). What the messages hold, and what goes
+wrong with them, is in ``simulation``: at every tick the node asks there for what has arrived by now. A tick that
+comes late makes up for what it missed, so that a busy machine delays messages and loses none. The truth is never
+published.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from calib_planner_msgs.action import ExecutePlan
 from geometry_msgs.msg import PointStamped
-from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
+from calib_planner.arrays import check_number
 from calib_planner.errors import CalibPlannerError, InputError
 from calib_planner.io import config_folder, read_instrument
 from calib_planner.ros.executor import check_executable
-from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.messages import joints_message, plan_from_message, point_message
 from calib_planner.ros.model import load_shipped
 from calib_planner.ros.qos import SENSOR_OUT
@@ -50,20 +49,8 @@ PATIENCE = 2.0
 """Time that an execution gets to end when it is stopped [s]."""
 
 
-@dataclass(frozen=True)
-class Execution:
-    """A tour and when it began [ns]."""
-
-    tour: Tour
-    began: int
-
-    def seconds(self, stamp: int) -> float:
-        """Time since it began [s]."""
-        return (stamp - self.began) / NANO
-
-
 class SimulatorNode(ManagedNode[SimulatorParameters]):
-    """See the module.
+    """The simulated cell as a node.
 
     Attributes:
         world: Robot, tracker and faults, once configured: for tests, which may know the truth.
@@ -72,11 +59,9 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
     THREADS = 3
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        self._busy, self._closing = threading.Lock(), threading.Event()
-        self._present = threading.Lock()  # what was sampled is past: a tour begins and ends after it
+        self._work = OneAtATime()
+        self._present = threading.Lock()  # a tour begins and ends after everything that was sampled
         super().__init__("tracker_simulator", SimulatorParameters(), context, overrides)
-
-    # ── lifecycle ────────────────────────────────────────────────────────────────────────────────────
 
     def configure(self) -> None:
         """Draw the true errors, make the publishers."""
@@ -94,40 +79,27 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def activate(self) -> None:
         """Publish, and take plans."""
-        self._closing.clear()
+        self._work.closing.clear()
         chosen = self.settings.value
         rates = Rates(chosen.joint_rate, chosen.tracker_rate)
-        self._streams = Streams(self.world, self._itinerary.at, rates, self._now())
+        self._streams = Streams(self.world, self._itinerary.at, rates, self.now)
         self.create_timer(1.0 / max(chosen.joint_rate, chosen.tracker_rate), self._publish)
-        self.create_action_server(
-            ExecutePlan,
-            "~/execute_plan",
-            self._on_goal,
-            callback_group=ReentrantCallbackGroup(),
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )
+        self.create_action_server(ExecutePlan, "~/execute_plan", self._on_goal)
         self.get_logger().info(f"{self.world.robot.name} with hidden errors stands still")
 
     def deactivate(self) -> None:
         """End an execution that is under way."""
-        self._closing.set()
-        if self._busy.acquire(timeout=PATIENCE):
-            self._busy.release()
+        self._work.end(PATIENCE)
 
     def close(self) -> bool:
-        """End everything; whether an execution ended in time."""
+        """End everything; returns whether an execution ended in time."""
         super().close()
-        return not self._busy.locked()
-
-    # ── the world ────────────────────────────────────────────────────────────────────────────────────
-
-    def _now(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
+        return self._work.ended
 
     def _publish(self) -> None:
         names, frame = self.world.robot.joint_names, self.settings.value.frame_id
         with self._present:
-            messages = self._streams.advance(self._now())
+            messages = self._streams.advance(self.now)
         for message in messages:
             if message.stream:
                 point = point_message(message.values, message.stamp, frame)
@@ -135,40 +107,31 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             else:
                 self._joint_publisher.publish(joints_message(names, message.values, message.stamp))
 
-    # ── execution ────────────────────────────────────────────────────────────────────────────────────
-
     def _on_goal(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
-        result = ExecutePlan.Result()
-        if not self._busy.acquire(blocking=False):
+        kind = ExecutePlan.Result
+        with self._work.turn() as mine:
+            if not mine:
+                goal.abort()
+                return kind(status=kind.BUSY, message="another plan is being executed: wait for it or cancel it")
+            try:
+                return self._execute(goal)
+            except CalibPlannerError as error:
+                result = kind(status=kind.INVALID_PLAN, message=cut(error))
+                self.get_logger().warning(f"plan refused: {result.message}")
+            except Exception as error:
+                result = kind(status=kind.ABORTED, message=reason_of(error))
+                if not self.context.ok():
+                    return result  # the process is ending, and the result is not sent
+                self.get_logger().error(result.message)
             goal.abort()
-            result.status = ExecutePlan.Result.BUSY
-            result.message = "another plan is being executed: wait for it or cancel it"
             return result
-        try:
-            return self._execute(goal, result)
-        except CalibPlannerError as error:
-            goal.abort()
-            result.status, result.message = ExecutePlan.Result.INVALID_PLAN, cut(error)
-            self.get_logger().warning(f"plan refused: {result.message}")
-            return result
-        except Exception as error:
-            if not self.context.ok():
-                return result  # the process is ending: nobody hears
-            goal.abort()
-            result.status, result.message = ExecutePlan.Result.ABORTED, f"{type(error).__name__}: {error}"
-            self.get_logger().error(result.message)
-            return result
-        finally:
-            self._busy.release()
 
-    def _execute(self, goal: ServerGoalHandle, result: ExecutePlan.Result) -> ExecutePlan.Result:
+    def _execute(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
         plan = plan_from_message(goal.request.plan).plan
-        dwell = float(goal.request.dwell)
-        if not 0 <= dwell <= 600:
-            raise InputError("dwell", dwell, "0 (the node's default) to 600 s")
+        dwell = check_number("dwell", goal.request.dwell, low=0.0, high=600.0, unit="s; 0: the node's default")
         check_executable(plan, self.world.robot)
         tour = make_tour(
-            self._itinerary.at(np.array([self._now()])).joints[0],
+            self._itinerary.at(np.array([self.now])).joints[0],
             plan.configurations,
             plan.repetitions,
             self.world.robot.joint_limits,
@@ -177,16 +140,17 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
         with self._present:
-            execution = Execution(tour, self._now())
-            self._itinerary.begin(tour, execution.began)
-        self._watch(goal, execution, len(plan.configurations))
+            began = self.now
+            self._itinerary.begin(tour, began)
+        self._watch(goal, tour, began, len(plan.configurations))
         with self._present:
-            stopped = self._now()
+            stopped = self.now
             self._itinerary.halt(stopped)
-        result.executed = tour.standstills(execution.seconds(stopped))
-        if self._closing.is_set():
+        seconds = (stopped - began) / NANO
+        result = ExecutePlan.Result(executed=tour.standstills(seconds))
+        if self._work.closing.is_set():
             return result
-        if goal.is_cancel_requested and execution.seconds(stopped) < tour.seconds:
+        if goal.is_cancel_requested and seconds < tour.seconds:
             result.status, result.message = ExecutePlan.Result.CANCELLED, "stopped on request"
             goal.canceled()
         else:
@@ -194,23 +158,21 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             goal.succeed()
         return result
 
-    def _watch(self, goal: ServerGoalHandle, execution: Execution, total: int) -> None:
-        """Send feedback until the end or a cancellation."""
-        while True:
-            seconds = execution.seconds(self._now())
-            ended = seconds >= execution.tour.seconds or goal.is_cancel_requested
-            if ended or self._closing.is_set():
+    def _watch(self, goal: ServerGoalHandle, tour: Tour, began: int, total: int) -> None:
+        """Send feedback until the tour that began at ``began`` [ns] ends or is cancelled."""
+        while (seconds := (self.now - began) / NANO) < tour.seconds:
+            if goal.is_cancel_requested or self._work.closing.is_set():
                 return
-            phase = execution.tour.at(seconds)
+            phase = tour.at(seconds)
             words = "measuring" if phase.measuring else "moving"
             goal.publish_feedback(
                 ExecutePlan.Feedback(index=phase.index, total=total, phase=words, seconds=seconds)
             )
-            self._closing.wait(FEEDBACK_PERIOD)
+            self._work.closing.wait(FEEDBACK_PERIOD)
 
 
 def make_world(chosen: SimulatorParameters) -> World:
-    """Robot with its true errors, given or drawn from the seed, tracker and faults.
+    """A robot with true errors (given, or drawn from the seed), a tracker and faults.
 
     Raises:
         InputError: A robot, parameter or true deviation that does not exist.

@@ -7,8 +7,8 @@
   node's name from its table of log publishers, even if another node of that name owns the entry by then: that
   node works on, but nothing of what it logs is heard on ``/rosout`` any more (ros2/rcl#1088 describes the table).
 - A transition that is impossible in the present state raises an exception in the callback of ``~/change_state``,
-  which ends the process of whoever was asked (ros2/rclpy#1209).
-- The present state can be asked for by a service only, not by a method.
+  which ends the process of the node (ros2/rclpy#1209).
+- A service tells the present state; no method does.
 - A parameter given at start (file, command line, launch) that no node declares is dropped without a word: a
   misspelt name leaves the default in place. No method lists what was given.
 
