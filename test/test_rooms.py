@@ -314,8 +314,8 @@ ALLOWED_NAMES = {
 ALLOWED_TEXT = re.compile(r"ThreadPool|ProcessPool|threadpool|held.out|hand on the stop", re.IGNORECASE)
 EXEMPT = ("identification",)
 """Its inside is rewritten next; its names come then."""
-LEFT_NAMES = {"campaign": 5, "io": 10, "cli": 7}
-LEFT_TEXT = {"campaign": 4, "io": 8}
+LEFT_NAMES = {"campaign": 5}
+LEFT_TEXT = {"campaign": 4}
 """Room or folder → how many are left at most. To be lowered until both tables are empty."""
 
 

@@ -56,7 +56,8 @@ def option(
     """
     if default is not None:
         kind = kind or type(default)
-        text = f"{text} ({default:g})" if isinstance(default, (int, float)) else f"{text} ({default})"
+        shown = f"{default:g}" if isinstance(default, (int, float)) else str(default)
+        text = f"{text} ({'none' if shown == 'inf' else shown})"
     group.add_argument(flag, type=kind or str, default=default, metavar=metavar, help=text, **more)
 
 

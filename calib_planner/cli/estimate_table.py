@@ -16,7 +16,7 @@ from rich.text import Text
 from calib_planner.identification import Estimate, NoiseLevels, Validation
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import is_nuisance
-from calib_planner.units import length
+from calib_planner.units import length, milli, milliradians, signed
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
@@ -81,21 +81,23 @@ def _distances(estimate: Estimate) -> Table:
         table.add_column(heading, justify="right")
     before, after = estimate.residuals.before, estimate.residuals.after
     label = "fitted" if estimate.transmission is None else "fitted, geometry"
-    cells = [_mm(before.mean), _mm(after.mean), "", _mm(after.rms), _mm(after.max)]
+    cells = [milli(before.mean), milli(after.mean), "", milli(after.rms), milli(after.max)]
     table.add_row(label, str(estimate.points.used), *cells)
-    for found in (estimate.cross_validation, estimate.validation):
-        if found is not None:
-            label = f"left out, {found.folds} folds" if found.folds else "held out"
-            table.add_row(label, str(found.count), *_held_out(found))
+    for result in (estimate.cross_validation, estimate.validation):
+        if result is not None:
+            label = f"left out, {result.folds} folds" if result.folds else "held out"
+            table.add_row(label, str(result.count), *_held_out(result))
             if estimate.transmission is not None:
-                table.add_row("… geometry alone", "", "", _mm(found.geometry_mean), "", _mm(found.geometry_rms))
+                table.add_row(
+                    "… geometry alone", "", "", milli(result.geometry_mean), "", milli(result.geometry_rms)
+                )
     return table
 
 
-def _held_out(found: Validation) -> list[str]:
-    lengths = (found.before_mean, found.mean, found.median, found.rms, found.max, found.predicted_rms)
-    inside = f"{100 * found.within_95:.0f} %" if np.isfinite(found.within_95) else "unknown"
-    return [*(_mm(v) for v in lengths), inside]
+def _held_out(v: Validation) -> list[str]:
+    lengths = (v.before_mean, v.mean, v.median, v.rms, v.max, v.predicted_rms)
+    inside = f"{100 * v.within_95:.0f} %" if np.isfinite(v.within_95) else "unknown"
+    return [*(milli(v) for v in lengths), inside]
 
 
 def _noise(estimate: Estimate) -> str:
@@ -112,14 +114,14 @@ def _noise(estimate: Estimate) -> str:
 
 def _corrections(estimate: Estimate) -> str:
     """What was learnt beside the geometry."""
-    found = estimate.transmission
-    return "" if found is None else f" Joint corrections were learnt: {1e3 * found.amplitude:.2g} mrad."
+    learnt = estimate.transmission
+    return "" if learnt is None else f" Joint corrections were learnt: {milliradians(learnt.amplitude)}."
 
 
 def _discrepancy(noise: NoiseLevels) -> str:
     if not noise.discrepancy > 0:
         return "; no model discrepancy"
-    parts = [f"{1e3 * noise.turning:.3g} mrad in each turning joint"] if noise.turning else []
+    parts = [f"{milliradians(noise.turning, 3)} in each turning joint"] if noise.turning else []
     parts += [f"{length(noise.sliding)} in each sliding joint"] if noise.sliding else []
     parts += [f"{length(noise.point)} in each point"] if noise.point else []
     return f"; beyond any geometric model {length(noise.discrepancy)} ({', '.join(parts)})"
@@ -158,8 +160,8 @@ def _parameters(estimate: Estimate) -> Table:
     for name, unit, *numbers in zip(estimate.fit.parameters, estimate.fit.units, *columns, strict=True):
         label, factor = SHOWN[unit]
         nominal, value, deviation, std = (factor * v for v in numbers)
-        held = name in estimate.observability.fixed
-        change = ["", ""] if held else [_signed(deviation), f"{std:.4f}"]
+        fixed = name in estimate.observability.fixed
+        change = ["", ""] if fixed else [signed(deviation, 4, plus=True), f"{std:.4f}"]
         table.add_row(
             name,
             label,
@@ -167,7 +169,7 @@ def _parameters(estimate: Estimate) -> Table:
             f"{value:.4f}",
             *change,
             remarks.get(name, ""),
-            style="dim" if held else "",
+            style="dim" if fixed else "",
         )
     if any(map(is_nuisance, estimate.fit.parameters)):
         table.caption = "nominal of an unknown base or target: its closed-form start"
@@ -175,12 +177,12 @@ def _parameters(estimate: Estimate) -> Table:
 
 
 def _remarks(estimate: Estimate) -> dict[str, str]:
-    """Held, or with which other parameter most strongly correlated."""
-    found = dict.fromkeys(estimate.observability.fixed, "held")
+    """Fixed, or with which other parameter most strongly correlated."""
+    remarks = dict.fromkeys(estimate.observability.fixed, "fixed")
     for a, b, correlation in estimate.fit.correlations:  # strongest first
         for one, other in ((a, b), (b, a)):
-            found.setdefault(one, f"correlated {correlation:+.3f} with {other}")
-    return found
+            remarks.setdefault(one, f"correlated {correlation:+.3f} with {other}")
+    return remarks
 
 
 def _show_list(console: Console, title: str, lines: Sequence[str]) -> None:
@@ -208,12 +210,3 @@ def _show_points(
 
 def _more(count: int, shown: int) -> str:
     return f" … and {count - shown} more (all in --json)" if count > shown else ""
-
-
-def _signed(value: float) -> str:
-    text = f"{value:+.4f}"
-    return text[1:] if float(text) == 0 else text
-
-
-def _mm(metres: float) -> str:
-    return f"{1e3 * metres:.4f}" if np.isfinite(metres) else "unknown"

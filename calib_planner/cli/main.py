@@ -52,8 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         words = bind_negative(sys.argv[1:] if argv is None else argv)
         args = parser(next((w for w in words if w in COMMANDS), "")).parse_args(words)
-    except SystemExit as stop:
-        return int(stop.code or DONE)
+    except SystemExit as end:
+        return int(end.code or DONE)
     terminal = Terminal(json_wanted=args.json)
     try:
         args.run(args, terminal)

@@ -24,7 +24,7 @@ from calib_planner.io import (
 )
 from calib_planner.planning import DWELL, Pace, PlanSheet, plan_sheet
 from calib_planner.robot import Robot
-from calib_planner.units import duration, length, signed
+from calib_planner.units import duration, joint_unit, length, signed
 
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --configurations 6 \\
       --constraints config/constraints.yaml --output plan.yaml
@@ -105,16 +105,16 @@ def show_sheet(sheet: PlanSheet, console: Console) -> None:
     plan, checks, times = sheet.plan, sheet.checks, sheet.timetable
     console.print(
         f"Plan {sheet.identity} for {sheet.robot.name}: {plan.measurements} measurements at "
-        f"{len(plan.configurations)} stops, about {duration(times.seconds)}"
+        f"{len(plan.configurations)} visits, about {duration(times.seconds)}"
     )
     console.print(_promise(sheet))
-    console.print(_stops(sheet))
+    console.print(_visits(sheet))
     console.print(f"Checked: {', '.join(checks.checked)}. Not checked: {', '.join(checks.unchecked)}.")
     if plan.robot != sheet.robot.name:
         console.print(f"The plan was made for {plan.robot}.", style="yellow")
     for i, broken in enumerate(checks.breaks, 1):
         if broken:
-            console.print(f"Stop {i} breaks: {', '.join(broken)}", style="red")
+            console.print(f"Visit {i} breaks: {', '.join(broken)}", style="red")
 
 
 def _promise(sheet: PlanSheet) -> str:
@@ -128,12 +128,12 @@ def _promise(sheet: PlanSheet) -> str:
     return f"{accuracy}{bound} ({quality.bound}), efficiency {100 * quality.efficiency:.1f} %."
 
 
-def _stops(sheet: PlanSheet) -> Table:
-    table = Table(title="stops, in the order of visiting")
+def _visits(sheet: PlanSheet) -> Table:
+    table = Table(title="visits, in their order")
     table.add_column("#", justify="right")
     turns = sheet.robot.joint_is_revolute
     for name, turning in zip(sheet.plan.joint_names, turns, strict=True):
-        table.add_column(f"{name}\n[{'°' if turning else 'mm'}]", justify="right", overflow="fold")
+        table.add_column(f"{name}\n[{joint_unit(turning)}]", justify="right", overflow="fold")
     for heading in ("times", "travel\nmax", "reach", "visible"):
         table.add_column(heading, justify="right", overflow="fold")
     visible = sheet.checks.visible
@@ -150,7 +150,7 @@ def _stops(sheet: PlanSheet) -> Table:
 
 
 def _travel(sheet: PlanSheet, i: int) -> str:
-    """The longest way of a joint to stop i, in what people read."""
+    """The longest way of a joint to visit i, in degrees or mm."""
     if np.isnan(sheet.timetable.travel[i]).any():
         return "–"
     turns = sheet.robot.joint_is_revolute

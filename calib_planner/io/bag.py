@@ -385,9 +385,9 @@ def storage_parts(path: str | Path) -> list[Path]:
         raise FileFormatError(path, "file", error.strerror or error, WHAT, "check the path") from None
     if any(p.name == "metadata.yaml" for p in files):
         return [place]
-    found = sorted((p for p in files if p.suffix in STORAGE), key=_numbered)
-    if found:
-        return found
+    storage = sorted((p for p in files if p.suffix in STORAGE), key=_numbered)
+    if storage:
+        return storage
     inner = [p.name for p in files if (p / "metadata.yaml").is_file()]
     advice = f"give one of the folders in it: {_list(inner)}" if inner else "give the folder that ros2 bag wrote"
     raise FileFormatError(path, "folder", _list([p.name for p in files]), WHAT, advice)
@@ -409,20 +409,20 @@ def _rosbags() -> tuple[Any, Any]:
 
 
 def _check_topics(path: str | Path, readers: list[Any], names: tuple[str, ...]) -> None:
-    held: dict[str, set[str]] = {}
+    types_of: dict[str, set[str]] = {}
     for connection in (c for r in readers for c in r.connections):
-        held.setdefault(connection.topic, set()).add(connection.msgtype)
-    described = _list([f"{t} ({', '.join(sorted(held[t]))})" for t in sorted(held)])
+        types_of.setdefault(connection.topic, set()).add(connection.msgtype)
+    described = _list([f"{t} ({', '.join(sorted(types_of[t]))})" for t in sorted(types_of)])
     for stream, name in enumerate(names):
         wanted, option = (POINT, "--point-topic") if stream else (JOINT_STATE, "--joint-topic")
-        fitting = [t for t in sorted(held) if held[t] == {wanted}]
+        fitting = [t for t in sorted(types_of) if types_of[t] == {wanted}]
         close = (get_close_matches(name, fitting, n=1, cutoff=0.3) or fitting)[:1]
         advice = f"is it {option} {close[0]}?" if close else f"record a topic of type {wanted}"
-        if name not in held:
+        if name not in types_of:
             got = f"a bag with {described}"
             raise FileFormatError(path, f"topic {name}", got, f"messages of {wanted}", advice)
-        if held[name] != {wanted}:
-            raise FileFormatError(path, f"topic {name}", ", ".join(sorted(held[name])), wanted, advice)
+        if types_of[name] != {wanted}:
+            raise FileFormatError(path, f"topic {name}", ", ".join(sorted(types_of[name])), wanted, advice)
 
 
 def _write_ahead(path: str | Path) -> str:

@@ -152,8 +152,8 @@ def require_columns(table: Table, names: Sequence[str], what: str) -> None:
     Raises:
         FileFormatError: Names what is missing and what the file has.
     """
-    held, wanted = set(table.columns), set(names)
-    missing = [n for n in names if n not in held]
+    present, wanted = set(table.columns), set(names)
+    missing = [n for n in names if n not in present]
     if not missing:
         return
     others = {c.casefold(): c for c in table.columns if c not in wanted and len(c) <= 100}
@@ -275,7 +275,7 @@ def angle_factors(robot: Robot, *, degrees: bool) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class MeasurementFile:
-    """What a file held.
+    """What a file of measurements holds.
 
     Attributes:
         data: The measurements.

@@ -200,9 +200,9 @@ class SavedEstimate:
         units: ``m`` or ``rad``.
         nominal: (P,) values before; for base and targets the closed-form start [unit].
         values: (P,) identified [unit].
-        deviations: (P,) identified value − nominal [unit]; 0 where held.
-        std: (P,) standard deviations [unit], NaN where held.
-        covariance: (P, P), eq. (11); zero where held.
+        deviations: (P,) identified value − nominal [unit]; 0 where fixed.
+        std: (P,) standard deviations [unit], NaN where fixed.
+        covariance: (P, P), eq. (11); zero where fixed.
         sigma: Standard deviation of one coordinate that the covariance rests on [m].
         status: A key of ``identification.estimate.STATUS``.
         base: (9,) the base's pose, see ``BASE`` [m, rad]; ``None`` if the file does not say.
@@ -236,7 +236,7 @@ class SavedEstimate:
     document: dict[str, Any]
 
     def calibrated(self, robot: Robot) -> Robot:
-        """The nominal ``robot`` with all parameters found, base and targets too: ``Estimate.calibrated`` again.
+        """The nominal ``robot`` with all identified values, base and targets too: ``Estimate.calibrated`` again.
 
         Raises:
             InputError: The estimate is of another robot or version of it, or the file lacks base and targets.
@@ -258,10 +258,10 @@ class SavedEstimate:
         Raises:
             InputError, UnknownNameError: As ``calibrated``.
         """
-        placed, found = self.calibrated(robot), self.joint_corrections
-        if found is None:
+        placed, learnt = self.calibrated(robot), self.joint_corrections
+        if learnt is None:
             return placed
-        values = dict(zip(found.parameters, found.values.tolist(), strict=True))
+        values = dict(zip(learnt.parameters, learnt.values.tolist(), strict=True))
 
         def moved(e: Element) -> Element:
             return replace(e, value=values.get(e.parameter or "", e.value))
@@ -277,8 +277,8 @@ class SavedEstimate:
         """
         self.check_robot(robot)
         names = self.chain_parameters
-        found = dict(zip(self.parameters, self.deviations.tolist(), strict=True))
-        return robot.with_deviations({n: found[n] for n in names})
+        deviations = dict(zip(self.parameters, self.deviations.tolist(), strict=True))
+        return robot.with_deviations({n: deviations[n] for n in names})
 
     def check_robot(self, robot: Robot) -> None:
         """Refuse a robot that is not the nominal one of this estimate.
@@ -330,7 +330,7 @@ def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:
 
 
 def _places(robot: Robot, targets: dict[tuple[int, int], float]) -> FloatArray:
-    """(targets, 3) the robot's targets [m], or as many as the estimate has, at the places found."""
+    """(targets, 3) the robot's targets [m], or as many as the estimate has, at the identified places."""
     count = max(len(robot.targets), *(t + 1 for t, _ in targets))
     places = np.zeros((count, 3))
     places[: len(robot.targets)] = robot.target_offsets

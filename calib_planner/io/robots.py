@@ -235,15 +235,15 @@ def _limits(joint: Node) -> tuple[float, float]:
 
 def _with_placement_errors(chain: Sequence[Element], joint_names: Sequence[str]) -> list[Element]:
     """The chain with six placement errors in front of every joint."""
-    found: list[Element] = []
+    elements: list[Element] = []
     for element in chain:
         if element.joint is not None:
             name = joint_names[element.joint]
-            found += [
+            elements += [
                 Element(kind, parameter=f"{name}.{x}") for kind, x in zip(KINDS, PLACEMENT_ERRORS, strict=True)
             ]
-        found.append(element)
-    return found
+        elements.append(element)
+    return elements
 
 
 register_file_reader(load_robot)

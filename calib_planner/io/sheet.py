@@ -75,7 +75,7 @@ def write_sheet_csv(path: str | Path, sheet: PlanSheet, field: str = "output") -
 
 def sheet_csv(sheet: PlanSheet) -> str:
     """The text of ``write_sheet_csv``."""
-    rows = [_row(sheet, i, stop) for i, stop in enumerate(sheet.to_dict()["stops"])]
+    rows = [_row(sheet, i, visit) for i, visit in enumerate(sheet.to_dict()["stops"])]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(rows[0])
@@ -83,31 +83,31 @@ def sheet_csv(sheet: PlanSheet) -> str:
     return out.getvalue()
 
 
-def _row(sheet: PlanSheet, i: int, stop: dict[str, Any]) -> dict[str, Any]:
-    """Column name to value, in order; ``stop`` is the i-th of ``to_dict``."""
+def _row(sheet: PlanSheet, i: int, visit: dict[str, Any]) -> dict[str, Any]:
+    """Column name to value, in order; ``visit`` is the i-th of ``to_dict``."""
     plan, sight, times = sheet.plan, sheet.checks.sight, sheet.timetable
     turns = sheet.robot.joint_is_revolute
-    row: dict[str, Any] = {"order": stop["order"], "configuration_index": stop["configuration_index"]}
+    row: dict[str, Any] = {"order": visit["order"], "configuration_index": visit["configuration_index"]}
 
     def put(name: str, value: Any) -> None:
         if name in row:
             raise InputError("joint names", name, "names that are not those of other columns of the sheet")
         row[name] = value
 
-    for name, value in stop["joints"].items():
+    for name, value in visit["joints"].items():
         put(name, value)
     for name, value, turning in zip(plan.joint_names, sheet.degrees[i], turns, strict=True):
         put(f"{name}_{'deg' if turning else 'mm'}", value)
-    put(REPETITIONS, stop["repetitions"])
+    put(REPETITIONS, visit["repetitions"])
     for turning, unit in ((True, "rad"), (False, "m")):
         if (turns == turning).any():
             put(f"travel_max_{unit}", sheet.total_travel(True, turning)[i])
             put(f"travel_sum_{unit}", sheet.total_travel(False, turning)[i])
-    put("margin", stop["margin"])
-    put("margin_joint", stop["margin_joint"])
-    put("reachable", WORDS[stop["reachable"]])
-    put("visible", WORDS[stop["visible"]])
-    put("breaks", "; ".join(" ".join(name.split()) for name in stop["breaks"]))
+    put("margin", visit["margin"])
+    put("margin_joint", visit["margin_joint"])
+    put("reachable", WORDS[visit["reachable"]])
+    put("visible", WORDS[visit["visible"]])
+    put("breaks", "; ".join(" ".join(name.split()) for name in visit["breaks"]))
     for t in range(len(sheet.robot.targets)):
         put(f"range{t + 1}_m", sight.ranges[i, t])
         put(f"elevation{t + 1}_rad", sight.elevations[i, t])
@@ -156,7 +156,7 @@ def trajectory(sheet: PlanSheet) -> dict[str, Any]:
     """
     for i, broken in enumerate(sheet.checks.reach_breaks, 1):
         if broken:
-            raise InfeasibleError(", ".join(broken), f"stop {i} of the plan breaks it; no trajectory goes there")
+            raise InfeasibleError(", ".join(broken), f"visit {i} of the plan breaks it; no trajectory goes there")
     times, points = sheet.timetable, []
     for q, arrive, leave in zip(sheet.plan.configurations.tolist(), times.arrive, times.leave, strict=True):
         points.append(_point(q, arrive))

@@ -20,7 +20,7 @@ then ignored. The state is rebuilt by ``from_measurements``: what was planned an
     {"format": …, "campaign": "3f2a…", "robot": …, "joint_names": […], "targets": 1}
     {"measured": 7, "role": "fit", "configuration": […], "points": [[x, y, z]]}      number of the measurement
     {"withdrawn": 7}
-    {"excluded": […], "radius": 0.05, "reason": "…", "asked": false}
+    {"excluded": […], "radius": 0.05, "reason": "…", …}
     {"joined": true}                                  the validation so far is part of the fit from here on
     {"finished": "reached"}
 
@@ -183,7 +183,7 @@ def plan_of(path: str | Path, text: str | None) -> Plan | None:
 
 
 def same_plan(one: Plan | None, other: Plan | None) -> bool:
-    """Whether two plans ask for the same: what was found on the way to them does not count."""
+    """Whether two plans are of the same measurements; their quality does not count."""
     if one is None or other is None:
         return one is other
     names = ("robot", "joint_names", "parameters", "configurations", "repetitions", "test_poses")
@@ -438,7 +438,7 @@ def open_store(
     Args:
         folder: Is made if it is not there; empty: in memory, gone with the process.
         model: The robot it has to belong to; one in which nothing was measured yet takes any.
-        settings: What else decides what an estimate is; kept for the record.
+        settings: What else decides what an estimate is; stored for the record.
         version: Of this package, for the record.
         field: The parameter that named the folder, for errors.
 

@@ -500,7 +500,7 @@ def _new_attribute(data: bytes, tag: int, key: str, value: FloatArray) -> tuple[
 
 
 def _replaced(old: str, value: FloatArray) -> str:
-    """The attribute's text with the numbers that changed replaced, its white space kept."""
+    """The attribute's text with the numbers that changed replaced; its white space stays."""
     if _floats(old, 3) is None:  # character references: equal to no number as they stand
         return _text(value)
     new = iter(value)

@@ -110,7 +110,7 @@ def test_what_is_held_and_what_is_correlated(run: Run, arm: tuple[Path, Path]) -
     result, (out, _) = run(*words), run(*words, shown=True)
     held = [u["parameter"] for u in result["unidentifiable"]]
     lines = {line.split("│")[1].strip(): line for line in out.splitlines() if line.startswith("│")}
-    assert len(held) > 8 and all("held" in lines[name] for name in held)
+    assert len(held) > 8 and all("fixed" in lines[name] for name in held)
     assert f"… and {len(held) - 8} more" in out and result["unidentifiable"][0]["combination"] in out
     assert "closed-form start" in out
     few = run(*words, "--prior", "typical")

@@ -74,7 +74,7 @@ def test_no_trajectory_to_what_breaks_a_constraint(plan_file, tmp_path, capsys):
     limits.write_text("joint_range: {joint_a1: [-0.001, 0.001]}")
     options = ("--constraints", str(limits), "--output", str(folder))
     status, out, err = call(capsys, "sheet", "--plan", plan_file, *options)
-    assert status == 0 and "No trajectory" in err and "Stop 1 breaks: joint range" in out
+    assert status == 0 and "No trajectory" in err and "Visit 1 breaks: joint range" in out
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES[:3])
 
 
