@@ -59,7 +59,6 @@ from calib_planner.io import (
     write_kinematics,
 )
 from calib_planner.measurements import Measurements
-from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
 
@@ -367,6 +366,11 @@ def write_outputs(args: argparse.Namespace, problem: IdentificationProblem, esti
     if args.output:
         write_estimate(args.output, estimate, "--output")
     if args.report:
+        from calib_planner.report import (  # 0.1 s for templates, which only a report needs
+            provenance,
+            write_report,
+        )
+
         inputs = [("robot", args.robot), *(("data", f) for f in args.data)]
         inputs += [("held out", f) for f in args.validate or ()]
         command = shlex.join(["calib-planner", *sys.argv[1:]])

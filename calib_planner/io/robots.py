@@ -1,4 +1,31 @@
-"""The robots that come with the package, and ``load_robot`` for those and for files."""
+"""Robots from files: those that come with the package, users' URDFs, and users' YAML files.
+
+A robot YAML holds the chain of eq. (2) element by element:
+
+    name: planar_2r
+    joints:                       # order of all joint arrays
+      - {name: q1, lower: -180, upper: 180, unit: deg}
+    elements:                     # amount = sign · (value + deviation + joint)
+      - {type: Rz, joint: q1, parameter: dq1}
+      - {type: Tx, value: 1.0, parameter: l1}
+    targets: [[0, 0, 0]]          # optional, in the tip's frame [m]
+    base: {xyz: [0, 0, 0], rpy: [0, 0, 0]}    # optional [m, rad]
+    lengths: [l1]                 # the parameters of the level "lengths"
+    offsets: [dq1]                # the parameters of the level "offsets"
+    levels: {elbow: [l1, dq2]}    # optional, further levels
+
+In place of ``elements``, a table, standard (``dh``) or modified (``modified_dh``), see ``robot.dh_elements``:
+
+    dh:
+      length_unit: mm             # of a and d: m (default) or mm
+      angle_unit: deg             # of alpha and theta: rad (default) or deg
+      rows:                       # what is not given is 0; type: revolute (default), prismatic or fixed
+        - {joint: q1, theta: 0, d: 0, a: 1000, alpha: 0}
+        - {joint: q2, type: prismatic, sign: -1, alpha: 90}
+
+A table brings its own ``lengths`` and ``offsets``, unless they are given, and the level ``dh``. Six placement
+errors ``<joint>.x … <joint>.rz`` in front of every joint are added to either; they make up the level ``full``.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +55,16 @@ from calib_planner.robot import (
 URDF_SUFFIXES = (".urdf", ".xml", ".xacro", ".sdf")
 """Files that are read as URDF; what is another format after all is told so by its content."""
 YAML_SUFFIXES = (".yaml", ".yml")
+CHAINS = ("elements", "dh", "modified_dh")
+KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", "lengths", "offsets", "levels")
+ELEMENT_KEYS = ("type", "value", "joint", "sign", "parameter")
+TABLE_KEYS = ("rows", "length_unit", "angle_unit")
+ROW_KEYS = ("joint", "type", "theta", "d", "a", "alpha", "sign")
+JOINT_KEYS = ("name", "lower", "upper", "unit")
+ANGLES = {"rad": 1.0, "deg": np.pi / 180.0}
+LENGTHS = {"m": 1.0, "mm": 1e-3}
+PLACEMENT_ERRORS = ("x", "y", "z", "rx", "ry", "rz")
+Levels = Mapping[str, tuple[str, ...]]
 
 
 def config_folder() -> Path:
@@ -68,43 +105,6 @@ def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: st
 def _shipped_robot(path: Path) -> Robot:
     """The robot of a file of the package, read and compiled once: robots are immutable."""
     return read_robot_yaml(path)
-
-
-# ── Robots as YAML: the chain of eq. (2) element by element, or a Denavit–Hartenberg table ──────────────────
-#     name: planar_2r
-#     joints:                       # order of all joint arrays
-#       - {name: q1, lower: -180, upper: 180, unit: deg}
-#     elements:                     # amount = sign · (value + deviation + joint)
-#       - {type: Rz, joint: q1, parameter: dq1}
-#       - {type: Tx, value: 1.0, parameter: l1}
-#     targets: [[0, 0, 0]]          # optional, in the tip's frame [m]
-#     base: {xyz: [0, 0, 0], rpy: [0, 0, 0]}    # optional [m, rad]
-#     lengths: [l1]                 # the parameters of the level "lengths"
-#     offsets: [dq1]                # the parameters of the level "offsets"
-#     levels: {elbow: [l1, dq2]}    # optional, further levels
-#
-# In place of ``elements``, a table, standard (``dh``) or modified (``modified_dh``), as in ``dh.py``:
-#
-#     dh:
-#       length_unit: mm             # of a and d: m (default) or mm
-#       angle_unit: deg             # of alpha and theta: rad (default) or deg
-#       rows:                       # what is not given is 0; type: revolute (default), prismatic or fixed
-#         - {joint: q1, theta: 0, d: 0, a: 1000, alpha: 0}
-#         - {joint: q2, type: prismatic, sign: -1, alpha: 90}
-#
-# A table brings its own ``lengths`` and ``offsets``, unless they are given, and the level ``dh``. Six placement
-# errors ``<joint>.x … <joint>.rz`` in front of every joint are added to either; they make up the level ``full``.
-
-CHAINS = ("elements", "dh", "modified_dh")
-KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", "lengths", "offsets", "levels")
-ELEMENT_KEYS = ("type", "value", "joint", "sign", "parameter")
-TABLE_KEYS = ("rows", "length_unit", "angle_unit")
-ROW_KEYS = ("joint", "type", "theta", "d", "a", "alpha", "sign")
-JOINT_KEYS = ("name", "lower", "upper", "unit")
-ANGLES = {"rad": 1.0, "deg": np.pi / 180.0}
-LENGTHS = {"m": 1.0, "mm": 1e-3}
-PLACEMENT_ERRORS = ("x", "y", "z", "rx", "ry", "rz")
-Levels = Mapping[str, tuple[str, ...]]
 
 
 def read_robot_yaml(path: Path) -> Robot:

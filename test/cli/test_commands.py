@@ -323,17 +323,26 @@ def test_real_robots_are_planned_with_their_systematic_errors(call: Any, tmp_pat
     assert paper["predicted_accuracy"] <= real["predicted_accuracy"]
 
 
-HEAVY = ("scipy.stats", "scipy.spatial", "scipy.linalg", "matplotlib", "sqlite3", "jinja2", "rosbags")
-"""Packages that take a tenth of a second or more each and that few commands use."""
+NEVER = ("scipy.stats", "matplotlib", "sqlite3", "jinja2", "rosbags")
+SHORT = (*NEVER, "scipy.spatial", "scipy.linalg")
+"""Packages of a tenth of a second or more each: no --help waits for the first, no short command for any."""
 
 
-@pytest.mark.parametrize("words", [["--help"], ["robots", "list"], ["robots", "show", "ur10e"]], ids=" ".join)
-def test_short_commands_import_what_they_use(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("line", "heavy"),
+    [
+        ("--help", SHORT),
+        ("robots list", SHORT),
+        ("robots show ur10e", SHORT),
+        *((f"{command} --help", NEVER) for command in ("plan", "identify", "campaign", "sheet", "simulate")),
+    ],
+)
+def test_commands_import_what_they_use(line: str, heavy: tuple[str, ...]) -> None:
     script = f"""
 import sys
 from calib_planner.cli import main
-assert main({words!r}) == 0
-print([name for name in {HEAVY!r} if name in sys.modules])
+assert main({line.split()!r}) == 0
+print([name for name in {heavy!r} if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.stdout.splitlines()[-1] == "[]", done.stderr
