@@ -29,10 +29,15 @@ from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.identification import start_robot
 from calib_planner.io import read_measurements
-from calib_planner.planning import Candidates, PlanProblem, plan
-from calib_planner.planning.bound import candidate_design
-from calib_planner.planning.criteria import Determinant
-from calib_planner.planning.search.exchange import ChoiceProblem, choose
+from calib_planner.planning import (
+    Candidates,
+    ChoiceProblem,
+    Determinant,
+    PlanProblem,
+    candidate_design,
+    choose,
+    plan,
+)
 from calib_planner.robot import analyse
 
 COUNTS = (10, 20, 30)

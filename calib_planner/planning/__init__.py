@@ -3,6 +3,7 @@
 docs/glossary.md explains the words.
 """
 
+from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.budget import Split, plan_for_accuracy, split_budget
 from calib_planner.planning.certify.prove import PROOF_STATUS
 from calib_planner.planning.constraints import (
@@ -16,7 +17,7 @@ from calib_planner.planning.constraints import (
     WorkspaceBox,
 )
 from calib_planner.planning.constraints.self_collision import SelfCollision
-from calib_planner.planning.criteria import CRITERIA
+from calib_planner.planning.criteria import CRITERIA, Determinant
 from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.feasibility import Constraint, Feasibility
 from calib_planner.planning.information import (
@@ -37,5 +38,6 @@ from calib_planner.planning.problem import (
 )
 from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
 from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlanQuality
+from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
 from calib_planner.planning.tour import DWELL, PEAK, Pace, timetable, usual_pace, visiting_order
