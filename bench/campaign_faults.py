@@ -43,7 +43,6 @@ from std_srvs.srv import Trigger
 from calib_planner import Robot
 from calib_planner.errors import CalibPlannerError
 from calib_planner.io import read_measurements
-from calib_planner.io.store import FILE as STORE
 from calib_planner.ros.demo import DemoClient
 from calib_planner.ros.messages import estimate_from_message
 from calib_planner.ros.processes import Nodes
@@ -300,7 +299,7 @@ def lost(desk: Desk, folder: Path, last: CampaignStatus) -> list[str]:
     """What was told accepted and is not kept, in words."""
     kept = (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER)
     told = {n: m for n, m in last_told(desk).items() if m.status in kept}
-    with sqlite3.connect(folder / "store" / STORE) as store:
+    with sqlite3.connect(next((folder / "store").glob("*.sqlite"))) as store:
         rows = dict(store.execute("SELECT number, points FROM standstills WHERE points IS NOT NULL"))
     gone = [f"standstill {n} is not in the store" for n in told if n not in rows]
     for number, message in told.items():

@@ -70,7 +70,7 @@ def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) ->
 
     Args:
         state: Its ``action`` is ``Replan`` or ``Validate``.
-        stopped: Asked while a plan is searched; true: take the best so far.
+        stopped: Called while a plan is searched; true: take the best so far.
 
     Raises:
         InfeasibleError: There is no first plan: constraints that leave nothing, or too small a budget.
@@ -113,7 +113,7 @@ def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable
     first = len(state.configurations)
     queue = toured(state, q, tuple(range(first, first + len(q))))
     twice = _spread(queue, min(repeated, allowed - len(q)))
-    stops = tuple(PlannedConfiguration(row, FIT, 1 + (first + k in twice)) for k, row in enumerate(q))
+    planned = tuple(PlannedConfiguration(row, FIT, 1 + (first + k in twice)) for k, row in enumerate(q))
     left = _left(state, known)
     if known is None and np.isfinite(made.quality.predicted_accuracy):
         share = max(made.quality.predicted_accuracy / problem.required_accuracy, 0.0) ** 2
@@ -121,7 +121,7 @@ def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable
     total = len(queue) + len(twice)
     text = f"{total} measurements planned"
     made_round = round_of(state, known, total, text)
-    return NextStep(FIT, text, stops, (), (*queue, *reversed(twice)), round=made_round, left=left)
+    return NextStep(FIT, text, planned, (), (*queue, *reversed(twice)), round=made_round, left=left)
 
 
 def plan_problem(state: CampaignState, known: Assessment | None) -> PlanProblem:

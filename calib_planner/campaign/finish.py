@@ -90,8 +90,8 @@ def validation(state: CampaignState, known: Assessment | None = None) -> NextSte
         if len(q):
             first = len(state.configurations)
             queue = toured(state, q, tuple(range(first, first + len(q))))
-            stops = tuple(PlannedConfiguration(row, VALIDATION) for row in q)
-            return NextStep(VALIDATION, state.message, stops, (), queue, left=state.left)
+            planned = tuple(PlannedConfiguration(row, VALIDATION) for row in q)
+            return NextStep(VALIDATION, state.message, planned, (), queue, left=state.left)
     held_out = state.data(VALIDATION)
     if held_out is not None and contradicted(known.estimate, known.noise, held_out):
         if state.outcome == "reached" and problem.budget - state.spent() > problem.validation:

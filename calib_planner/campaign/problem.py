@@ -307,8 +307,8 @@ class CampaignResult:
             ],
             "estimate": None if self.estimate is None else self.estimate.to_dict(),
         }
-        found: dict[str, Any] = plain(result)
-        return found
+        values: dict[str, Any] = plain(result)
+        return values
 
 
 def _rows(data: Measurements | None) -> dict[str, Any] | None:

@@ -29,7 +29,7 @@ def run_campaign(
     """Do what the campaign says until it says that it is done.
 
     Args:
-        problem: What is asked, or a state to go on from.
+        problem: The campaign's problem, or a state from which it continues.
         measure: See ``Instrument``.
         watch: Told of every new state; what it raises ends the campaign.
 

@@ -10,7 +10,7 @@ and taken in by ``decided`` whenever it is ready; events that came meanwhile are
 *Visits* wait in a queue in the order of travel. A measurement takes its visit out; a failed attempt leaves it
 there until the configuration's attempts are used up; a configuration given up leaves with all its visits and with
 those in its neighbourhood, and when the batch is through the rest is planned around it. A measurement that is
-withdrawn (found to be an outlier, undone) puts its visit back. Pausing changes nothing but the next action.
+withdrawn (as an outlier, or undone) puts its visit back. Pausing changes nothing but the next action.
 
 The measurements are all that cannot be made again: ``from_measurements`` begins where they end.
 """
@@ -182,7 +182,7 @@ class CampaignState:
 
     @property
     def given_up(self) -> int:
-        """Configurations that could not be measured, without those that a person asked to skip."""
+        """Configurations that could not be measured, without those that a person wanted to skip."""
         return sum(not e.requested for e in self.exclusions) + len(self.dropped)
 
     @property
@@ -272,12 +272,12 @@ class CampaignState:
 
     def decided(self, step: NextStep) -> CampaignState:
         """Take in what ``decide`` returned."""
-        stops = [replace(s, role=FIT) for s in self.configurations] if step.joins else list(self.configurations)
+        planned = [replace(s, role=FIT) for s in self.configurations] if step.joins else list(self.configurations)
         for index, more in step.again:
-            stops[index] = replace(stops[index], times=stops[index].times + more)
+            planned[index] = replace(planned[index], times=planned[index].times + more)
         return replace(
             self,
-            configurations=(*stops, *step.configurations),
+            configurations=(*planned, *step.configurations),
             queue=(*self.queue, *(i for i in step.queue if i not in self._gone)),
             rounds=self.rounds if step.round is None else (*self.rounds, step.round),
             phase=step.phase,
@@ -363,11 +363,11 @@ def from_measurements(
         ordered = data.in_order_of(problem.robot.joint_names)
         labels = configuration_labels(ordered.q)
         first = len(state.configurations)
-        stops = [
+        planned = [
             PlannedConfiguration(ordered.q[labels == k][0], role, int((labels == k).sum()))
             for k in range(labels.max() + 1)
         ]
-        state = replace(state, configurations=(*state.configurations, *stops))
+        state = replace(state, configurations=(*state.configurations, *planned))
         for q, points, label in zip(ordered.q, ordered.p, labels, strict=True):
             if not np.isnan(points).all():
                 state = state.measured(first + int(label), q, points)
