@@ -309,9 +309,6 @@ ALLOWED_NAMES = {
 ALLOWED_TEXT = re.compile(r"ThreadPool|ProcessPool|threadpool|held.out|hand on the stop", re.IGNORECASE)
 EXEMPT = ("identification",)
 """Its inside is rewritten next; its names come then."""
-LEFT_NAMES: dict[str, int] = {}
-LEFT_TEXT: dict[str, int] = {}
-"""Room or folder → how many are left at most. To be lowered until both tables are empty."""
 
 
 def names_defined(tree: ast.AST) -> Iterator[str]:
@@ -370,7 +367,7 @@ WITH_WORDS = [p for p in (*PLACES, "docs", "msg_defs", "config") if p not in EXE
 @pytest.mark.parametrize("place", WITH_WORDS)
 def test_no_name_is_made_of_old_words(place: str) -> None:
     left = [f"{m}: {n}" for m, p in files_of(place) for n in old_names(tree_of(p))]
-    assert len(left) <= LEFT_NAMES.get(place, 0), left
+    assert not left
 
 
 @pytest.fixture(scope="module")
@@ -383,8 +380,7 @@ def words() -> dict[str, Counter[str]]:
 
 @pytest.mark.parametrize("place", WITH_WORDS)
 def test_no_text_speaks_in_old_words(place: str, words: dict[str, Counter[str]]) -> None:
-    left = words.get(place, Counter())
-    assert left.total() <= LEFT_TEXT.get(place, 0), left
+    assert not words.get(place)
 
 
 def test_the_words_are_seen_where_they_are() -> None:
