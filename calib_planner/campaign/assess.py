@@ -188,13 +188,9 @@ def outcome_of(state: CampaignState, known: Assessment | None) -> tuple[str, str
         return "unreachable", f"{state.given_up} configurations given up: {cut('; '.join(reasons), 300)}"
     if state.spent(FIT) >= problem.fit_budget:
         now = "nothing identified" if known is None else f"{length(known.accuracy)} predicted"
-        return (
-            "budget_spent",
-            f"{now}, {required}{_forecast_text(state, known)}",
-        )
+        return "budget_spent", f"{now}, {required}{_forecast_text(state, known)}"
     if known is not None and ready(state, known) and limited(state, known):
-        text = f"{length(known.floor)} at a test pose are the robot's own, {required}"
-        return "limited", text
+        return "limited", f"{length(known.floor)} at a test pose are the robot's own, {required}"
     return "", ""
 
 
@@ -236,6 +232,7 @@ def _forecast_text(state: CampaignState, known: Assessment | None) -> str:
 
 
 def round_of(state: CampaignState, known: Assessment | None, planned: int, note: str) -> Round:
+    """The record of this round."""
     number = len(state.rounds)
     if known is None:
         nan = float("nan")

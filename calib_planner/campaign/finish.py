@@ -221,7 +221,7 @@ def campaign_verdict(estimate: Estimate, required: float, at_test_poses: Measure
 
 
 def contradicted(estimate: Estimate, noise: Noise, held_out: Measurements) -> bool:
-    """Whether held-out measurements are improbably far from what was predicted, for as sure as it was."""
+    """Whether held-out measurements are improbably far from the predictions, given their covariance."""
     q, seen = held_out.q, held_out.seen
     if estimate.transmission is not None:
         covariance = estimate.transmission.error_covariance(q)

@@ -25,9 +25,9 @@ from calib_planner.robot import Robot
 
 STATUS = {
     "ok": "All requested parameters were identified.",
-    "rank_deficient": "Some parameters cannot be told apart from others by these data and were held at their "
-    "nominal values; see the combinations listed. Measure in other configurations or ask for fewer.",
-    "not_converged": "The iteration did not settle: check units, joint order and signs, and the start.",
+    "rank_deficient": "These data cannot tell some parameters from others, so they stay fixed at their nominal "
+    "values; see the combinations listed. Measure in other configurations or ask for fewer.",
+    "not_converged": "The iteration did not converge: check units, joint order and signs, and the start.",
 }
 """Every status an estimate can have, with advice."""
 LEVELS = ("PASS", "WARN", "FAIL")

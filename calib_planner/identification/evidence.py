@@ -39,7 +39,7 @@ WEAK = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A finished fit and everything that was found on the way; see ``Estimate`` for the meanings."""
+    """A finished fit and the results of all checks; see ``Estimate`` for the meanings."""
 
     problem: IdentificationProblem
     robot: Robot
@@ -198,11 +198,11 @@ def _accuracy(evidence: Evidence, poses: FloatArray) -> Accuracy:
 
 
 def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
-    """(K,) whether a pose moves with a combination that was held because hardly any measured point does."""
-    held = [k for k, i in enumerate(evidence.identifiability.fixed) if i not in evidence.resolved]
-    if not held:
+    """(K,) whether a pose moves with a combination that is fixed because hardly any measured point does."""
+    unseen = [k for k, i in enumerate(evidence.identifiability.fixed) if i not in evidence.resolved]
+    if not unseen:
         return np.zeros(len(poses), bool)
-    directions = evidence.identifiability.directions[held].T
+    directions = evidence.identifiability.directions[unseen].T
     seen = np.linalg.norm(evidence.jacobian @ directions, axis=2).max(axis=(0, 1))
     there = np.linalg.norm(evidence.robot.jacobian(poses, evidence.at) @ directions, axis=1)
     return np.asarray((there > 10.0 * seen + BLIND).any(axis=1))
@@ -213,7 +213,7 @@ def _nearly_dependent(fit: Fit, names: tuple[str, ...]) -> tuple[str, ...]:
     if not fit.kept:
         return ()
     _, values, vt = np.linalg.svd(fit.triangle)
-    found = []
+    weakest = []
     columns = list(fit.kept)
     for value, row in zip(values[::-1], vt[::-1], strict=True):
         if value > WEAK:
@@ -221,8 +221,8 @@ def _nearly_dependent(fit: Fit, names: tuple[str, ...]) -> tuple[str, ...]:
         change = np.zeros(len(names))
         change[columns] = np.where(np.abs(row) > 0.1 * np.abs(row).max(), row / fit.scale, 0.0)
         first = int(np.argmax(np.abs(change)))
-        found.append(describe(change / change[first], names, first))
-    return tuple(found)
+        weakest.append(describe(change / change[first], names, first))
+    return tuple(weakest)
 
 
 def _rejected(evidence: Evidence, predicted: FloatArray) -> tuple[RejectedPoint, ...]:

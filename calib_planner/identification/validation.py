@@ -7,7 +7,7 @@ At a held-out point the expected covariance of measured − predicted is
 of the parameters, of the errors that no geometric model describes, and of the measurement itself. If the
 covariance is right, 95 % of the points lie inside their 95 % region (χ²₃).
 
-A *re-seated target* has a new offset, to be found from a few rows of the validation data. The systematic error
+A *re-seated target* has a new offset, which comes from a few rows of the validation data. The systematic error
 that no geometric model describes would go into that offset, so what the calibration residuals predict of it at
 those rows (see ``fit_discrepancy``) is subtracted first. The test rows are not changed. With G the
 pseudoinverse that turns errors e₀ at those rows into an error of the offset, and J_t = ∂p/∂t, the error at a
@@ -67,7 +67,7 @@ def validate(
     models = _models(estimate)
     before = _Geometry(_before(problem), estimate)
     discrepancy = _discrepancy(problem, estimate) if target_from and estimate.transmission is None else None
-    found: list[list[_Prediction]] = []
+    predictions: list[list[_Prediction]] = []
     for data in (d.in_order_of(problem.robot.joint_names) for d in held_out):
         if len(data) <= target_from:
             raise NotEnoughDataError(
@@ -79,8 +79,8 @@ def validate(
         seat, rest = data.select(np.arange(target_from)), data.select(np.arange(target_from, len(data)))
         expected = np.zeros((len(seat), 3)) if discrepancy is None else discrepancy.predict(seat.q)
         cleaned = Measurements(seat.joint_names, seat.q, seat.p - expected[:, None], seat.std)
-        found.append([*(_predict(m, cleaned, rest) for m in models), _predict(before, seat, rest)])
-    return judged(replace(estimate, validation=_statistics(found)))
+        predictions.append([*(_predict(m, cleaned, rest) for m in models), _predict(before, seat, rest)])
+    return judged(replace(estimate, validation=_statistics(predictions)))
 
 
 @one_thread
@@ -105,9 +105,9 @@ def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: in
     for k in range(folds):
         rows = problem.data.select(np.flatnonzero(fold != k))
         part = replace(problem, data=rows, test_poses=None, starts=0, joint_corrections=again)
-        found = identify(part, start=estimate)
+        others = identify(part, start=estimate)
         rest = used.select(np.flatnonzero(fold == k))
-        models = (*_models(found), _Geometry(_before(part), found))
+        models = (*_models(others), _Geometry(_before(part), others))
         parts.append([_predict(m, rest.select(np.arange(0)), rest) for m in models])
     return judged(replace(estimate, cross_validation=replace(_statistics(parts), folds=folds)))
 

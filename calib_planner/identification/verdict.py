@@ -68,7 +68,7 @@ _HIDDEN = (
 _PREDICTED = "predicted at the test poses: {worst} where {required} are required"
 
 _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
-    ("not_converged", "the iteration did not settle", {"FAIL": "{message}"}),
+    ("not_converged", "the iteration did not converge", {"FAIL": "{message}"}),
     (
         "other_minimum",
         "{elsewhere} of {starts} other starts ended elsewhere",
