@@ -216,9 +216,13 @@ class Measuring:
 
     def back_to_fit(self) -> None:
         """Tell the identifier the last plan of the fit again."""
-        fits = [p for p in self._plans.values() if p.role == FIT]
-        if fits and self._plan is not fits[-1]:
-            self._announce(fits[-1])
+        fit = self._last_fit
+        if fit is not None and self._plan is not fit:
+            self._announce(fit)
+
+    @property
+    def _last_fit(self) -> Announced | None:
+        return next((p for p in reversed(self._plans.values()) if p.role == FIT), None)
 
     def heard(self, message: Measurement, state: CampaignState) -> CampaignState:
         """Take what the identifier publishes about a standstill.
@@ -280,11 +284,17 @@ class Measuring:
 
     def _tell(self, state: CampaignState, visit: Visit) -> None:
         """Announce the plan and wait until the identifier has it, before the robot goes there."""
-        plan = self._plan
-        if plan is None or not plan.covers(visit.action.index, state):
+        plan, fit = self._plan, self._last_fit
+        if fit is not None and not {m.index for m in state.measurements_of(FIT)} <= {*fit.numbers}:
+            # Measurements of a validation joined the fit: the identifier has to count them to it from now on.
+            plan = announced(state, self._id, FIT)
+            self._announce(plan)
+        elif plan is not None and plan is fit and visit.action.role == VALIDATION and self.taken != plan.plan_id:
+            pass  # the identifier has to take the plan of the fit before it is told that of the validation
+        elif plan is None or not plan.covers(visit.action.index, state):
             plan = announced(state, self._id, visit.action.role)
             self._announce(plan)
-        if self.taken == plan.plan_id:
+        if self.taken == plan.plan_id and plan.covers(visit.action.index, state):
             self._wait_for("")
             visit.next("sending")
         elif time.monotonic() - visit.since > RETRY:

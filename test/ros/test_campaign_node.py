@@ -16,6 +16,7 @@ from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from desk import ASKED, NAME, Desk, S
 from fake_cell import FakeCell
+from geometry_msgs.msg import Point
 from rclpy.parameter import Parameter
 
 from calib_planner import Robot
@@ -80,6 +81,33 @@ def test_a_campaign_with_simulator_and_identifier(bench: Bench, tmp_path: Path) 
     assert len(read_measurements(tmp_path / f"{ids['measurements']}.csv", robot).data) == done.measured
     saved = read_estimate(tmp_path / f"{ids['estimate']}.yaml")
     np.testing.assert_array_equal(saved.deviations, found.deviations)
+
+
+def test_measurements_of_a_validation_that_join_the_fit_are_in_the_last_plan_of_the_fit(
+    bench: Bench, cell: FakeCell
+) -> None:
+    """The identifier is told so before the next validation, and again in the end."""
+    rng, first = np.random.default_rng(5), set[str]()
+
+    def answer(q: np.ndarray) -> str:
+        name = cell._plan.plan_id
+        first.update([name] if "-validation-" in name and not first else [])
+        if name not in first:
+            return "ok"
+        x, y, z = cell.cell.truth.positions(q[None])[0, 0] + 1e-4 * rng.standard_normal(3)
+        cell.publish(q, points=[Point(x=x, y=y, z=z)])
+        return "ignore"
+
+    cell.answer = answer
+    desk = Desk(bench)
+    assert desk.call("start")[0]
+    done = desk.until(S.DONE, 90.0)
+    assert any("join the fit" in m.reason for m in desk.heard)
+    bench.wait(lambda: "-fit-" in cell.plans[-1].plan_id)
+    assert sum(cell.plans[-1].repetitions) == done.measured
+    names = [p.plan_id for p in cell.plans]
+    joined = names.index(names[-1])
+    assert "-validation-" in names[joined - 1] and any("-validation-" in n for n in names[joined + 1 :])
 
 
 def simulator_process(folder: Path, domain: int) -> subprocess.Popen[bytes]:
