@@ -17,11 +17,9 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
 from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement
@@ -78,7 +76,6 @@ class DemoClient:
         self._executor.add_node(self._node)
         self.estimate: CalibrationEstimate | None = None
         self.measurements: list[Measurement] = []
-        self.feedback: ExecutePlan.Feedback | None = None
         create = self._node.create_subscription
         create(CalibrationEstimate, "calibration_identifier/estimate", self._on_estimate, LATCHED)
         create(Measurement, "calibration_identifier/measurements", self.measurements.append, EVENTS)
@@ -164,8 +161,7 @@ class DemoClient:
 
     def _run(self, plan: PlanMessage, done: Callable[[], bool], deadline: float) -> ExecutePlan.Result | None:
         """One execution to its end; ``None`` if nobody answered."""
-        self.feedback = None
-        sent = self._execute.send_goal_async(ExecutePlan.Goal(plan=plan), feedback_callback=self._on_feedback)
+        sent = self._execute.send_goal_async(ExecutePlan.Goal(plan=plan))
         self.wait(lambda: sent.done() or done(), ATTEMPT)
         if not sent.done() or sent.result() is None:
             # There was no answer; the goal may run all the same, and the estimates then show its end.
@@ -207,9 +203,6 @@ class DemoClient:
     def _on_estimate(self, message: CalibrationEstimate) -> None:
         self.estimate = message
 
-    def _on_feedback(self, message: Any) -> None:
-        self.feedback = message.feedback
-
 
 class Screen:
     """Progress on stderr: a moving bar on a terminal, lines elsewhere."""
@@ -234,30 +227,27 @@ class Screen:
         self._bar.stop()
 
 
-@dataclass(frozen=True)
-class Options:
-    """Size and seed of the demo, and the folder for its files."""
-
-    configurations: int
-    seed: int
-    folder: Path
-
-
-def run_demo(options: Options, screen: Screen) -> DemoResult:
+def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> DemoResult:
     """Plan, measure and identify; returns the comparison with the truth.
+
+    Args:
+        configurations: Configurations of the plan.
+        seed: Seed of true errors, noise and search.
+        folder: The folder for all files.
+        screen: Shows the progress.
 
     Raises:
         CalibPlannerError: The error says what failed, with the last lines of a node that ended.
     """
-    with own_domain() as domain, Nodes(options.folder / "log", domain) as nodes:
+    with own_domain() as domain, Nodes(folder / "log", domain) as nodes:
         screen.say("starting planner, identifier and simulated tracker")
         nodes.start("planner_node", {"robot": ROBOT})
-        save = {"save_folder": f"'{options.folder.resolve()}'", "samples": SAMPLES, "sigma": SIGMA}
+        save = {"save_folder": f"'{folder.resolve()}'", "samples": SAMPLES, "sigma": SIGMA}
         nodes.start("identifier_node", {"robot": ROBOT} | save)
-        nodes.start("simulator_node", {"robot": ROBOT, "seed": options.seed, "sigma": SIGMA})
+        nodes.start("simulator_node", {"robot": ROBOT, "seed": seed, "sigma": SIGMA})
         client = DemoClient(domain, nodes.check)
         try:
-            plan = _measure(options, client, screen)
+            plan = _measure(configurations, seed, client, screen)
             screen.say("saving")
             screen.console.print(client.save())
             estimate = estimate_from_message(client.estimate)
@@ -266,26 +256,26 @@ def run_demo(options: Options, screen: Screen) -> DemoResult:
     screen.say("comparing with random plans")
     robot = Robot.load(ROBOT).with_parameters(LEVEL)
     received = plan_from_message(plan).plan
-    problem = PlanProblem(robot, [TEST_POSE], options.configurations, noise=received.sigma)
-    truth = random_deviations(robot, options.seed)
-    result = demo_report(problem, received, estimate, truth, seed=options.seed, report=options.folder)
-    draw(result, options.folder / "demo.png")
-    (options.folder / "demo.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n")
+    problem = PlanProblem(robot, [TEST_POSE], configurations, noise=received.sigma)
+    truth = random_deviations(robot, seed)
+    result = demo_report(problem, received, estimate, truth, seed=seed, report=folder)
+    draw(result, folder / "demo.png")
+    (folder / "demo.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n")
     return result
 
 
-def _measure(options: Options, client: DemoClient, screen: Screen) -> PlanMessage:
+def _measure(configurations: int, seed: int, client: DemoClient, screen: Screen) -> PlanMessage:
     """Have a plan made and measured; the client holds the estimate afterwards."""
     screen.say("waiting for the planner")
     request = PlanCalibration.Request(
         robot=ROBOT,
         parameters=[LEVEL],
         test_poses=list(TEST_POSE),
-        configurations=options.configurations,
+        configurations=configurations,
         sigma=SIGMA / math.sqrt(SAMPLES),
-        seed=options.seed,
+        seed=seed,
     )
-    screen.say(f"planning {options.configurations} configurations")
+    screen.say(f"planning {configurations} configurations")
     plan = client.request_plan(request)
     best = 1e3 * plan.predicted_accuracy
     screen.console.print(
@@ -295,19 +285,14 @@ def _measure(options: Options, client: DemoClient, screen: Screen) -> PlanMessag
     client.wait(lambda: client.identifier_has(plan.plan_id), 30.0, "estimate from the identifier")
 
     def show() -> None:
-        done = client.estimate.measurements if client.estimate else 0
-        screen.say(f"measured {done} of {len(plan.repetitions)}{_error(client)}", done, len(plan.repetitions))
+        estimate, total = client.estimate, len(plan.repetitions)
+        done = estimate.measurements if estimate else 0
+        accuracy = list(estimate.predicted_accuracy) if estimate else []
+        error = f", error at the test pose now {length(accuracy[0])} (1 std)" if accuracy else ""
+        screen.say(f"measured {done} of {total}{error}", done, total)
 
-    client.execute(plan, 60.0 + 5.0 * options.configurations, show)
+    client.execute(plan, 60.0 + 5.0 * configurations, show)
     return plan
-
-
-def _error(client: DemoClient) -> str:
-    """The accuracy that the newest estimate predicts, in words."""
-    accuracy = np.asarray(client.estimate.predicted_accuracy) if client.estimate else np.empty(0)
-    if not accuracy.size:
-        return ""
-    return f", error at the test pose now {length(accuracy[0])} (1 std)"
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -328,7 +313,7 @@ def main(args: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the nodes, as Ctrl-C does
     screen = Screen()
     try:
-        result = run_demo(Options(chosen.configurations, chosen.seed, chosen.output), screen)
+        result = run_demo(chosen.configurations, chosen.seed, chosen.output, screen)
     except (CalibPlannerError, OSError) as error:
         screen.close()
         print(f"demo: {error}", file=sys.stderr)

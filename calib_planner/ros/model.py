@@ -12,16 +12,20 @@ them, they would say something else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from std_msgs.msg import String
 
 from calib_planner.arrays import FloatArray, frozen
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
 from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, shipped_robots, stored_model
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
+from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.qos import LATCHED
 from calib_planner.ros.settings import IdentifierParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
 
@@ -141,6 +145,21 @@ class ModelSource:
         )
         if settings.robot:
             self.model = shipped_model(settings.robot, settings.parameters, settings.unknown)
+
+    def follow(self, node: ManagedNode[Any], taken: Callable[[Model], None], **options: Any) -> None:
+        """In ``configure``: subscribe to descriptions, if they are wanted; ``taken`` gets every new model."""
+
+        def on_description(message: String) -> None:
+            try:
+                model = self.take(message.data)
+            except CalibPlannerError:
+                node.get_logger().error(self.refusal, throttle_duration_sec=1.0)
+                return
+            if model is not None:
+                taken(model)
+
+        if self._settings.use_robot_description:
+            node.create_subscription(String, TOPIC, on_description, LATCHED, **options)
 
     def take(self, text: str) -> Model | None:
         """Take a description; ``None`` if it is the one in use.

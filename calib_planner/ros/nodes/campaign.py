@@ -24,7 +24,6 @@ from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurem
 from calib_planner_msgs.msg import Plan as PlanMessage
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from std_msgs.msg import String
 
 from calib_planner.campaign import (
     CampaignResult,
@@ -90,8 +89,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._status = self.create_publisher(CampaignStatus, "~/status", LATCHED)
         self._estimates = self.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
         self._measuring = Measuring(self, self.create_publisher(PlanMessage, "~/plan", LATCHED))
-        if chosen.use_robot_description:
-            self.create_subscription(String, TOPIC, self._on_description, LATCHED)
+        self._source.follow(self, self._on_model)
         name = chosen.identifier
         self.create_subscription(Measurement, f"{name}/measurements", self._on_measurement, EVENTS)
         self.create_subscription(CalibrationEstimate, f"{name}/estimate", self._on_estimate, LATCHED)
@@ -197,16 +195,10 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             raise InputError(what, "no campaign under way", "one", "call ~/start")
         return self.campaign
 
-    def _on_description(self, message: String) -> None:
-        try:
-            model = self._source.take(message.data)
-        except CalibPlannerError:
-            self.get_logger().error(self._source.refusal, throttle_duration_sec=1.0)
-            return
-        if model is not None:
-            self.get_logger().info(f"{TOPIC}: {model.robot.name}; it counts from the next campaign on")
-            if self.is_active:
-                self._go_on_with_stored()
+    def _on_model(self, model: Model) -> None:
+        self.get_logger().info(f"{TOPIC}: {model.robot.name}; it counts from the next campaign on")
+        if self.is_active:
+            self._go_on_with_stored()
 
     def _on_estimate(self, message: CalibrationEstimate) -> None:
         self._measuring.taken = message.plan_id

@@ -21,7 +21,6 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
@@ -62,9 +61,7 @@ class PlannerNode(ManagedNode[PlannerParameters]):
             self.create_publisher(JointTrajectory, "~/trajectory", LATCHED),
             self.create_publisher(MarkerArray, "~/markers", LATCHED),
         )
-        if chosen.use_robot_description:
-            alone = MutuallyExclusiveCallbackGroup()
-            self.create_subscription(String, TOPIC, self._on_description, LATCHED, callback_group=alone)
+        self._source.follow(self, self._on_model, callback_group=MutuallyExclusiveCallbackGroup())
         self.create_service(
             PlanService, "~/request_plan", self._on_request, callback_group=ReentrantCallbackGroup()
         )
@@ -86,15 +83,8 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         super().close()
         return self._work.ended
 
-    def _on_description(self, message: String) -> None:
-        try:
-            model = self._source.take(message.data)
-        except CalibPlannerError:
-            self.get_logger().error(self._source.refusal, throttle_duration_sec=1.0)
-            return
-        if model is not None:
-            joints = ", ".join(model.robot.joint_names)
-            self.get_logger().info(f"{TOPIC}: {model.robot.name}, joints {joints}")
+    def _on_model(self, model: Model) -> None:
+        self.get_logger().info(f"{TOPIC}: {model.robot.name}, joints {', '.join(model.robot.joint_names)}")
 
     def _on_request(self, request: PlanService.Request, response: PlanService.Response) -> PlanService.Response:
         with self._work.turn() as mine:
