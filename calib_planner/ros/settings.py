@@ -60,9 +60,7 @@ class PlanParameters(RobotParameters):
     parameters: str = parameter("lengths+offsets", LEVEL)
     unknown: str = parameter("", UNKNOWN)
     constraints: str = parameter("", CONSTRAINTS)
-    constraints_folder: str = parameter(
-        "", "folder of the files of constraints; empty = the package's config", read_only=True
-    )
+    constraints_folder: str = parameter("", "folder of constraints; empty = the package's config", read_only=True)
     time_limit: float = parameter(60.0, "longest search of a plan", "s", 0.01, 86400.0)
     frame_id: str = parameter("base_link", "name of the robot's base frame")
 
@@ -76,15 +74,9 @@ class PlanParameters(RobotParameters):
 class PlannerParameters(PlanParameters):
     """Parameters of ``calibration_planner``."""
 
-    criterion: str = parameter(
-        "test_pose", "what is optimised, unless the request says otherwise", choices=CRITERIA
-    )
-    configurations: int = parameter(
-        12, "configurations of a plan, unless the request says otherwise", "", 1, 10000
-    )
-    repetitions: int = parameter(
-        1, "measurements at each configuration, unless the request says otherwise", "", 1, 10000
-    )
+    criterion: str = parameter("test_pose", "the criterion, unless the request says otherwise", choices=CRITERIA)
+    configurations: int = parameter(12, "configurations of a plan, if the request names none", "", 1, 10000)
+    repetitions: int = parameter(1, "measurements at each configuration, if the request names none", "", 1, 10000)
     sigma: float = parameter(3e-5, "noise of one coordinate of one measurement", "m", 1e-9, 1.0)
     starts: int = parameter(64, "random starts of the search", "", 1, 100000)
     most_configurations: int = parameter(200, "largest number of configurations in a request", "", 1, 10000)
@@ -102,20 +94,14 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
 
     parameters: str = at_configure("", LEVEL + "; empty = those of the plan")
     unknown: str = at_configure("", UNKNOWN)
-    sigma: float = parameter(
-        3e-5,
-        "noise of one coordinate of one tracker point; 0 = estimated from the scatter of the points",
-        "m",
-        0,
-        1,
-    )
+    sigma: float = parameter(3e-5, "noise of a coordinate of a point; 0 = from the scatter of points", "m", 0, 1)
     repeatability: float = parameter(
-        0.0, "standard deviation that averaging does not reduce (robot, reflector)", "m", 0.0, 1.0
+        0.0, "scatter that averaging does not reduce (robot, reflector)", "m", 0.0, 1.0
     )
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
     plan_topic: str = at_configure("calibration_planner/current_plan", "topic of the plan")
     plan_tolerance: float = parameter(
-        0.01, "largest difference of a joint to the planned configuration", "rad or m", 1e-6, 1.0
+        0.01, "largest joint difference to a planned configuration", "rad or m", 1e-6, 1.0
     )
     accept_unplanned: bool = parameter(False, "accept standstills at configurations that are in no plan")
     keep_measurements: bool = parameter(False, "a new plan begins with the measurements of the plan before")
@@ -184,21 +170,15 @@ class SimulatorParameters(LifecycleParameters, Faults):
 class CampaignParameters(PlanParameters):
     """Parameters of ``calibration_campaign``; what can change is taken when a campaign begins (~/start)."""
 
-    targets: int = parameter(
-        0, "number of reflectors; 0 = as the robot has; others need unknown to hold tool", "", 0, 100
-    )
+    targets: int = parameter(0, "reflectors; 0 = as the robot has, others need unknown: tool", "", 0, 100)
     test_poses: str = parameter(
         "", "where accuracy matters: joint coordinates [rad | m] with spaces between, poses with semicolons"
     )
-    required_accuracy: float = parameter(
-        1e-4, "largest root mean square error at the test poses that is good enough", "m", 1e-9, 1.0
-    )
+    required_accuracy: float = parameter(1e-4, "largest rms error at the test poses that will do", "m", 1e-9, 1.0)
     budget: int = parameter(60, "measurements allowed in all, with validation and failed ones", "", 2, 10000)
     batch: int = parameter(6, "configurations planned at a time", "", 1, 200)
     validation: int = parameter(6, "measurements at the end that take no part in the fit", "", 0, 1000)
-    minimum: int = parameter(
-        4, "fewest different configurations, however accurate the estimate seems", "", 1, 1000
-    )
+    minimum: int = parameter(4, "fewest different configurations, however good the estimate seems", "", 1, 1000)
     attempts: int = parameter(2, "attempts at a configuration before it is given up", "", 1, 100)
     most_failures: int = parameter(20, "configurations given up before the campaign ends", "", 0, 10000)
     exclusion: float = parameter(
@@ -223,17 +203,11 @@ class CampaignParameters(PlanParameters):
     identifier: str = at_configure(
         "calibration_identifier", "name of the identifier, whose parameter plan_topic names ~/plan of this node"
     )
-    dwell: float = parameter(
-        0.0, "length of a standstill, per measurement; 0 = the robot's default", "s", 0.0, 600.0
-    )
-    patience: float = parameter(
-        10.0, "after a standstill, longest time until the identifier accepts or rejects it", "s", 0.1, 3600.0
-    )
-    silence: float = parameter(
-        30.0, "longest time without feedback from the robot while it moves", "s", 0.5, 3600.0
-    )
+    dwell: float = parameter(0.0, "length of a standstill, per measurement; 0 = the robot's", "s", 0.0, 600.0)
+    patience: float = parameter(10.0, "longest wait for the identifier after a standstill", "s", 0.1, 3600.0)
+    silence: float = parameter(30.0, "longest time without feedback from the robot as it moves", "s", 0.5, 3600.0)
     longest_wait: float = parameter(
-        600.0, "the campaign pauses when robot or identifier is away this long", "s", 1.0, 86400.0
+        600.0, "pause when robot or identifier is away for so long", "s", 1.0, 86400.0
     )
 
     def __post_init__(self) -> None:
