@@ -25,7 +25,7 @@ from calib_planner.planning import Callback, InformationModel, Plan, PlanProblem
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, independent_seeds, random_deviations
-from calib_planner.units import MILLI_UNIT
+from calib_planner.units import MILLI_UNIT, milli, signed
 
 RANDOM_PLANS = 100
 """Random plans that stand for chance: one alone may be lucky."""
@@ -259,8 +259,8 @@ def print_table(result: DemoResult, console: Console) -> None:
         table.add_column(heading, justify="right")
     for p in result.parameters:
         off = abs(p.value - p.true) / p.std if p.std > 0 else float("nan")
-        numbers = [f"{1e3 * x:+.4f}" for x in (p.true - p.nominal, p.value - p.nominal)]
-        table.add_row(p.name, MILLI_UNIT[p.unit], *numbers, f"{1e3 * p.std:.4f}", f"{off:.1f} std")
+        numbers = [signed(1e3 * x, 4, plus=True) for x in (p.true - p.nominal, p.value - p.nominal)]
+        table.add_row(p.name, MILLI_UNIT[p.unit], *numbers, milli(p.std), f"{off:.1f} std")
     console.print(table)
     errors = Table(title="position error at the test pose [mm]")
     errors.add_column("")
@@ -270,7 +270,7 @@ def print_table(result: DemoResult, console: Console) -> None:
         errors.add_row(name, f"{achieved:.4f}", "" if predicted is None else f"{predicted:.4f}")
     console.print(errors)
     console.print(
-        f"One measured coordinate has a standard deviation of {1e3 * result.sigma:.4f} mm. "
+        f"One measured coordinate has a standard deviation of {milli(result.sigma)} mm. "
         "The random plans were measured in simulation by the library: same true robot, same noise."
     )
 
@@ -283,7 +283,7 @@ def draw(result: DemoResult, path: str | Path) -> Path:
     accuracy, deviations, remainder = figure.subplots(1, 3, width_ratios=[1.2, 1, 1])
     figure.suptitle(
         f"{result.robot}: {result.configurations} configurations, "
-        f"{1e3 * result.before:.2f} mm before, {1e3 * result.after:.4f} mm after"
+        f"{1e3 * result.before:.2f} mm before, {milli(result.after)} mm after"
     )
     _draw_accuracy(accuracy, result)
     x, names = np.arange(len(result.parameters)), [p.name for p in result.parameters]

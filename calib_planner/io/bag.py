@@ -55,7 +55,7 @@ REPORT_EVERY = 2000
 
 @dataclass(frozen=True, eq=False)
 class BagMeasurements:
-    """What a bag says.
+    """The measurements of a bag, and what became of its messages.
 
     Attributes:
         data: One row per standstill, in the order of time; std from the scatter of the samples unless given.
@@ -206,7 +206,7 @@ class _BagIntake:
         self._detector = self.intake.detector
 
     def drain(self, recording: Recording, progress: Callable[[float, str], None] | None) -> str:
-        """Take all there is; returns what is damaged, in words, or nothing."""
+        """Read the whole recording; returns a description of the damage, which is empty if there is none."""
         total, done, stopped = max(sum(recording.promised), 1), 0, ""
         try:
             for stream, data in recording.messages():
