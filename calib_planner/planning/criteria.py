@@ -362,9 +362,3 @@ def reported_value(name: str, psi: float, size: int, measurements: int) -> float
     if name == "o5":
         return float(np.sqrt(psi)) / size
     return psi
-
-
-def efficiency(name: str, psi: float, bound: float) -> float:
-    """Value over bound in the criterion's own convention, at most 1: √(Ψ/Ψ*) for accuracies, Ψ/Ψ* else."""
-    ratio = psi / bound if bound > 0 else 0.0
-    return float(np.sqrt(max(ratio, 0.0))) if name in ("test_pose", "worst_pose") else float(ratio)

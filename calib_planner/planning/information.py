@@ -27,13 +27,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning.criteria import (
-    Accuracy,
-    Criterion,
-    Eliminating,
-    accuracy_weights,
-    make_criterion,
-)
+from calib_planner.planning.criteria import Accuracy, Criterion, Eliminating, accuracy_weights, make_criterion
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.robot import Identifiability, Linearisation, Robot, analyse, is_nuisance

@@ -17,12 +17,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.prove import Proof, prove_bound
-from calib_planner.planning.criteria import (
-    Compound,
-    Criterion,
-    efficiency,
-    reported_value,
-)
+from calib_planner.planning.criteria import Compound, Criterion, reported_value
 from calib_planner.planning.discrepancy import PredictionProblem, choose_for_prediction
 from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
 from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
@@ -375,10 +370,10 @@ def _rest_idle_joints(space: PlanSpace, configurations: FloatArray) -> FloatArra
 
 
 def _efficiency(name: str, psi: float, bound: float, value: float, value_bound: float) -> float:
-    """In the criterion's own convention; for accuracies the quotient of the two figures reported."""
+    """At most 1: for accuracies the quotient of the two reported figures, else Ψ/Ψ*."""
     if name in POSE_CRITERIA:
         return value_bound / value if np.isfinite(value) else 0.0
-    return efficiency(name, psi, bound)
+    return psi / bound if bound > 0 else 0.0
 
 
 def _psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:

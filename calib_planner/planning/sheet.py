@@ -275,6 +275,7 @@ def check_visits(
         masks = seen if isinstance(constraint, VIEWS) else reach
         allowed = constraint.allowed(robot, q)
         masks[constraint.name] = masks.get(constraint.name, True) & allowed
+    missing = [k.name for k in (*VIEWS, SelfCollision) if not any(isinstance(c, k) for c in constraints)]
     return VisitChecks(
         margins=frozen(margins),
         reachable=frozen(np.all(list(reach.values()), axis=0)),
@@ -282,7 +283,7 @@ def check_visits(
         reach_breaks=_breaks(reach, len(q)),
         view_breaks=_breaks(seen, len(q)),
         checked=(*reach, *seen),
-        unchecked=_unchecked(constraints),
+        unchecked=(*missing, *NEVER),
         sight=_sight(robot, q, constraints, noise),
     )
 
@@ -290,12 +291,6 @@ def check_visits(
 def _breaks(masks: dict[str, NDArray[np.bool_]], count: int) -> tuple[tuple[str, ...], ...]:
     """Per configuration the names of the masks (N,) that are false."""
     return tuple(tuple(name for name, mask in masks.items() if not mask[i]) for i in range(count))
-
-
-def _unchecked(constraints: Sequence[Constraint]) -> tuple[str, ...]:
-    kinds = (*VIEWS, SelfCollision)
-    missing = [k.name for k in kinds if not any(isinstance(c, k) for c in constraints)]
-    return (*missing, *NEVER)
 
 
 def _sight(robot: Robot, q: FloatArray, constraints: Sequence[Constraint], noise: Noise | None) -> Sight:

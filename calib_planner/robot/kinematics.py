@@ -214,23 +214,12 @@ def first_turn(structure: Structure) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class Trace:
-    """The wanted quantities, in symbols.
+def trace(structure: Structure, split: int) -> tuple[Tracer, list[Ref]]:
+    """All that the structure wants, traced from a frame of its own behind the first ``split`` elements.
 
-    Attributes:
-        tracer: Holds the nodes.
-        outputs: Positions, columns, axes, origins, three components each.
-        shape: ``(targets, columns, axes)``.
+    Returns:
+        The nodes, and the outputs: positions, columns, axes, origins, three components each.
     """
-
-    tracer: Tracer
-    outputs: list[Ref]
-    shape: tuple[int, int, int]
-
-
-def trace(structure: Structure, split: int) -> Trace:
-    """All that the structure wants, traced from a frame of its own behind the first ``split`` elements."""
     tracer = Tracer()
     outer = _unit_frame()
     seen = _walk(tracer, outer, structure.trunk[:split], 0)
@@ -264,7 +253,7 @@ def trace(structure: Structure, split: int) -> Trace:
         outputs += [(sign * s, n) for s, n in axis]
     for e in structure.origins:
         outputs += _to_base(tracer, outer, behind[e], at=True) if e >= split else behind[e]
-    return Trace(tracer, outputs, (len(points), len(structure.columns), len(structure.axes)))
+    return tracer, outputs
 
 
 def _unit_frame() -> Frame:
@@ -405,20 +394,16 @@ def compile_program(structure: Structure) -> Program:
     turned into the base frame at the end: an arm that moves in a plane there is mostly zeros. The shorter
     program is used.
     """
-    candidates = [_lay_out(trace(structure, split)) for split in (0, first_turn(structure))]
+    shape = (len(structure.branches), len(structure.columns), len(structure.axes))
+    candidates = [_lay_out(*trace(structure, split), shape) for split in (0, first_turn(structure))]
     return min(candidates, key=lambda program: len(program.vectors) + len(program.copies))
 
 
-_UFUNCS: dict[str, Callable[..., Any]] = {
-    "mul": np.multiply,
-    "add": np.add,
-    "sub": np.subtract,
-}
+_UFUNCS: dict[str, Callable[..., Any]] = {"mul": np.multiply, "add": np.add, "sub": np.subtract}
 
 
-def _lay_out(traced: Trace) -> Program:
+def _lay_out(tracer: Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -> Program:
     """Drop dead operations, give live vectors a place, write outputs where they belong."""
-    tracer, outputs = traced.tracer, traced.outputs
     needed = _needed(tracer, outputs)
     rows = len(outputs)
     home: dict[int, int] = {}
@@ -481,7 +466,7 @@ def _lay_out(traced: Trace) -> Program:
         registers=tuple(registers),
         scratch=used,
         rows=rows,
-        shape=traced.shape,
+        shape=shape,
     )
 
 

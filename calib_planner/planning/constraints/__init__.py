@@ -12,14 +12,3 @@ from calib_planner.planning.constraints.tracker import (
     TrackerElevation,
     TrackerRange,
 )
-
-__all__ = [
-    "Custom",
-    "JointRange",
-    "LineOfSight",
-    "MinimumHeight",
-    "ReflectorAcceptance",
-    "TrackerElevation",
-    "TrackerRange",
-    "WorkspaceBox",
-]
