@@ -37,7 +37,7 @@ from calib_planner import IdentificationProblem, identify
 from calib_planner.acquisition import Rejection, Standstill, StandstillDetector, StandstillSettings
 from calib_planner.io import BagTopics, StoredModel, is_bag, open_store, read_bag
 from calib_planner.io.bag import storage_parts
-from calib_planner.ros.session import Campaign, Matching
+from calib_planner.ros.session import Matching, Session
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 KINDS = [("SQLITE3", "NONE"), ("SQLITE3", "MESSAGE"), ("SQLITE3", "FILE")]
@@ -66,7 +66,7 @@ def test_a_bag_gives_what_the_node_gives(tmp_path: Path, plugin: str, compressio
         assert mine.joints.tobytes() == node.joints.tobytes() == found.data.q[row].tobytes()
         assert mine.points.tobytes() == node.points.tobytes() == found.data.p[row].tobytes()
     model = StoredModel(PLANAR.name, PLANAR.joint_names, len(PLANAR.targets), "")
-    live = Campaign(PLANAR, lambda _: PLANAR, open_store("", model, {}, ""))
+    live = Session(PLANAR, lambda _: PLANAR, open_store("", model, {}, ""))
     how = Matching(accept_unplanned=True, sigma=0.0)
     for node in expected:
         live.take(node, how)

@@ -44,7 +44,7 @@ def test_points_are_the_stops(make, dwell, tmp_path: Path) -> None:
 def test_no_trajectory_leads_beyond_a_joint_limit(tmp_path: Path) -> None:
     robot = Robot.load("planar_2r")
     sheet = plan_sheet(plan_of(robot, np.array([[0.0, 0.1], [3.2, 0.1]])), robot)
-    with pytest.raises(InfeasibleError, match="stop 2"):
+    with pytest.raises(InfeasibleError, match="visit 2"):
         write_trajectory(tmp_path / "t.yaml", sheet)
     assert not (tmp_path / "t.yaml").exists()
 
