@@ -1,5 +1,4 @@
-"""The base of the nodes: a lifecycle node that starts by itself, says why it cannot start, and survives
-exceptions.
+"""The base of the nodes: a lifecycle node that starts by itself, or says why not, and survives exceptions.
 
 A node implements four hooks: ``configure`` makes everything that the node needs from its parameters, ``activate``
 begins its work, ``deactivate`` ends what is under way, ``clean_up`` forgets. If a hook raises, the transition
@@ -51,9 +50,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 class LifecycleParameters:
     """The parameters that every node has; those of a node inherit from it."""
 
-    autostart: bool = parameter(
-        True, "go to active by itself; false: a lifecycle manager decides", read_only=True
-    )
+    autostart: bool = parameter(True, "go to active without a lifecycle manager", read_only=True)
 
 
 P = TypeVar("P", bound=LifecycleParameters)

@@ -1,5 +1,4 @@
-"""Node ``calibration_campaign``: measures, with the robot and the identifier, until the estimate is accurate
-enough.
+"""Node ``calibration_campaign``: has the robot measured until the estimate is accurate enough.
 
 The library's ``campaign`` says what is to be done next (a pure state machine); plans are made by the library in a
 thread of their own. This file carries it out: ``Measuring`` tells the identifier the plan (latched ``~/plan``,
