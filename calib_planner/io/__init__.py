@@ -47,11 +47,11 @@ if TYPE_CHECKING:
         NOT_STORED,
         OUTLIER,
         UNDONE,
-        CampaignStore,
         Journal,
         Record,
-        StoredCampaign,
+        SessionStore,
         StoredModel,
+        StoredSession,
         UnavailableStore,
         begin_journal,
         open_journal,
@@ -82,7 +82,7 @@ else:
             "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
             "sources": "Sources SourceSettings read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
-            "CampaignStore Journal Record StoredCampaign StoredModel UnavailableStore begin_journal "
+            "SessionStore Journal Record StoredSession StoredModel UnavailableStore begin_journal "
             "open_journal open_store stored_model",
             "text": "make_folder read_text user_path write_text",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "

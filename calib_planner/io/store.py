@@ -1,11 +1,11 @@
-"""What a campaign leaves on disk: nothing that was acknowledged is ever lost.
+"""What a session and a campaign leave on disk: nothing that was acknowledged is ever lost.
 
 *The store* of an identifier, ``campaign.sqlite`` in a folder that the user chose; without a folder the same in
-memory. Its tables only grow. A *standstill* is raw data and never changes. What was decided about it is a row
-of the log ``decisions``: a later decision replaces an earlier one, and both stay. A *record* is a standstill
-with its last decision, and a campaign is a plan with the records under it. Only the pointer to the current
-campaign moves, and a campaign in which nothing was measured gives way to the next. The model's source text, the
-settings and the version of the package that wrote are kept beside.
+memory. Its tables only grow. A *standstill* is raw data and never changes. What was decided about it is a row of
+the log ``decisions``: a later decision replaces an earlier one, and both stay. A *record* is a standstill with
+its last decision, and a *session* is a plan with the records under it (table ``campaigns``). Only the pointer to
+the current session moves, and a session in which nothing was measured gives way to the next. The model's source
+text, the settings and the version of the package that wrote are kept beside.
 
 SQLite writes ahead with ``synchronous=FULL``: a commit that returned survives ``kill -9`` and a power cut, one
 that did not leaves nothing behind. ``locking_mode=EXCLUSIVE`` keeps a second process out and needs no file of
@@ -229,11 +229,11 @@ class StoredModel:
 
 
 @dataclass(frozen=True, eq=False)
-class StoredCampaign:
+class StoredSession:
     """A plan and what was measured and decided under it.
 
     Attributes:
-        number: Of the campaign.
+        number: Number of the session.
         plan_id, plan: The plan, if any.
         records: Every standstill with the last decision about it, in the order of measuring.
     """
@@ -244,7 +244,7 @@ class StoredCampaign:
     records: tuple[Record, ...]
 
 
-class CampaignStore:
+class SessionStore:
     """An open store; ``open_store`` makes one.
 
     Attributes:
@@ -264,18 +264,18 @@ class CampaignStore:
         with self._turn:
             self._database.close()
 
-    def current(self) -> StoredCampaign | None:
-        """The campaign that goes on; ``None`` in a new store.
+    def current(self) -> StoredSession | None:
+        """The session that goes on; ``None`` in a new store.
 
         Raises:
             FileFormatError: Damaged rows.
             StoreError: The file cannot be read now.
         """
         row = self._one("SELECT c.* FROM campaigns AS c JOIN current ON current.campaign = c.number")
-        return None if row is None else self._campaign(row)
+        return None if row is None else self._session(row)
 
-    def find(self, plan_id: str, plan: Plan | None) -> StoredCampaign | None:
-        """The newest campaign of a plan; ``None`` if there is none.
+    def find(self, plan_id: str, plan: Plan | None) -> StoredSession | None:
+        """The newest session of a plan; ``None`` if there is none.
 
         Raises:
             InputError: There is another plan of this name, or the name is too long.
@@ -286,7 +286,7 @@ class CampaignStore:
         row = self._one("SELECT * FROM campaigns WHERE plan_id = ? ORDER BY number DESC LIMIT 1", plan_id)
         if row is None:
             return None
-        known = self._campaign(row)
+        known = self._session(row)
         if not same_plan(known.plan, plan):
             advice = "give the new plan a name of its own, or choose another folder"
             raise InputError("plan_id", repr(plan_id), "a name that no other plan in the store has", advice)
@@ -298,15 +298,15 @@ class CampaignStore:
         return self._one("SELECT 1 FROM standstills LIMIT 1") is None
 
     def history(self, standstill: int) -> list[dict[str, Any]]:
-        """All that was ever decided about a standstill, oldest first: campaign, status, reason, at."""
+        """All decisions about a standstill, oldest first: session (key ``campaign``), status, reason, at."""
         sql = "SELECT campaign, status, reason, at FROM decisions WHERE standstill = ? ORDER BY number"
         return [dict(r) for r in self._rows(sql, standstill)]
 
-    def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Record] = ()) -> StoredCampaign:
-        """Make a plan's campaign the current one: the one there is, or a new one.
+    def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Record] = ()) -> StoredSession:
+        """Make a plan's session the current one: the one there is, or a new one.
 
         Args:
-            carried: What a new campaign takes over from another, as decided under the new plan.
+            carried: What a new session takes over from another, as decided under the new plan.
 
         Raises:
             InputError: There is another plan of this name.
@@ -319,15 +319,15 @@ class CampaignStore:
             self._point_at(write, known.number)
         return known
 
-    def restart(self, plan_id: str, plan: Plan | None) -> StoredCampaign:
-        """A campaign of the same plan with nothing measured; the former stays in the file.
+    def restart(self, plan_id: str, plan: Plan | None) -> StoredSession:
+        """A session of the same plan with nothing measured; the former stays in the file.
 
         Raises:
             StoreError: It cannot be written.
         """
         return self._new(plan_id, plan, ())
 
-    def record(self, campaign: int, record: Record) -> int:
+    def record(self, session: int, record: Record) -> int:
         """Write a standstill and what was decided about it; returns its number.
 
         Raises:
@@ -335,10 +335,10 @@ class CampaignStore:
         """
         with self._writing() as write:
             number = _insert(write, "standstills", standstill_row(record.acquired, record.frame))
-            _decide(write, campaign, number, record)
+            _decide(write, session, number, record)
         return number
 
-    def decide(self, campaign: int, records: Sequence[Record]) -> None:
+    def decide(self, session: int, records: Sequence[Record]) -> None:
         """Write what is decided about standstills now, all of it or nothing.
 
         Raises:
@@ -347,31 +347,31 @@ class CampaignStore:
         if records:
             with self._writing() as write:
                 for record in records:
-                    _decide(write, campaign, record.number, record)
+                    _decide(write, session, record.number, record)
 
-    def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Record]) -> StoredCampaign:
+    def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Record]) -> StoredSession:
         with self._writing() as write:
             columns = {"plan_id": plan_id, "plan": plan_text(plan), "at": _now()}
             number = _insert(write, "campaigns", columns)
             self._point_at(write, number)
             for record in carried:
                 _decide(write, number, record.number, record)
-        return StoredCampaign(number, plan_id, plan, tuple(carried))
+        return StoredSession(number, plan_id, plan, tuple(carried))
 
     @staticmethod
     def _point_at(write: sqlite3.Connection, number: int) -> None:
-        """Make a campaign the current one; others without a standstill go: plans may come by the thousand."""
+        """Make a session the current one; others without a standstill go: plans may come by the thousand."""
         write.execute("INSERT OR REPLACE INTO current VALUES (1, ?)", (number,))
         write.execute(
             "DELETE FROM campaigns WHERE number != ? AND number NOT IN (SELECT campaign FROM decisions)",
             (number,),
         )
 
-    def _campaign(self, row: Mapping[str, Any]) -> StoredCampaign:
+    def _session(self, row: Mapping[str, Any]) -> StoredSession:
         where, joints, targets = self.path or "memory", len(self.model.joint_names), self.model.targets
         rows = self._rows(LATEST, row["number"])
         records = tuple(record_of(where, r, joints, targets) for r in rows)
-        return StoredCampaign(row["number"], row["plan_id"], plan_of(where, row["plan"]), records)
+        return StoredSession(row["number"], row["plan_id"], plan_of(where, row["plan"]), records)
 
     def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
         try:
@@ -413,7 +413,7 @@ class CampaignStore:
                 self._database.execute("ROLLBACK")
 
 
-class UnavailableStore(CampaignStore):
+class UnavailableStore(SessionStore):
     """Stands in for a store that cannot be opened at the moment: empty, and nothing can be written."""
 
     def __init__(self, model: StoredModel, error: StoreError) -> None:
@@ -432,7 +432,7 @@ class UnavailableStore(CampaignStore):
 
 def open_store(
     folder: str, model: StoredModel, settings: Mapping[str, object], version: str, field: str = "store_folder"
-) -> CampaignStore:
+) -> SessionStore:
     """Open the store in a folder, or make one.
 
     Args:
@@ -451,7 +451,7 @@ def open_store(
     database = connect(path, field)
     try:
         prepare(database, path, field)
-        store = CampaignStore(path, database, model)
+        store = SessionStore(path, database, model)
         _check_model(store)
         _note_settings(store, settings, version)
     except BaseException:
@@ -472,7 +472,7 @@ def stored_model(folder: str, field: str = "store_folder") -> StoredModel | None
     database = connect(path, field)
     try:
         prepare(database, path, field)
-        store = CampaignStore(path, database, StoredModel("", (), 0, ""))
+        store = SessionStore(path, database, StoredModel("", (), 0, ""))
         row = store._one("SELECT * FROM model")
         return None if row is None or store.empty else _model_of(row)
     finally:
@@ -484,7 +484,7 @@ def _model_of(row: Mapping[str, Any]) -> StoredModel:
     return StoredModel(row["name"], joints, row["targets"], row["source"], row["origin"])
 
 
-def _check_model(store: CampaignStore) -> None:
+def _check_model(store: SessionStore) -> None:
     model, row = store.model, store._one("SELECT * FROM model")
     stored = None if row is None else _model_of(row)
     if stored is None or (stored != model and store.empty):
@@ -509,7 +509,7 @@ def _check_same(path: Path | None, values: Mapping[str, tuple[object, object]]) 
             raise FileFormatError(path, name, cut(got, 100), str(expected), advice)
 
 
-def _note_settings(store: CampaignStore, settings: Mapping[str, object], version: str) -> None:
+def _note_settings(store: SessionStore, settings: Mapping[str, object], version: str) -> None:
     document = json.dumps(settings, sort_keys=True, default=list)
     last = store._one("SELECT * FROM settings ORDER BY number DESC LIMIT 1")
     if last is None or (last["document"], last["version"]) != (document, version):
@@ -517,9 +517,9 @@ def _note_settings(store: CampaignStore, settings: Mapping[str, object], version
             _insert(write, "settings", {"version": version, "document": document, "at": _now()})
 
 
-def _decide(write: sqlite3.Connection, campaign: int, standstill: int, record: Record) -> None:
+def _decide(write: sqlite3.Connection, session: int, standstill: int, record: Record) -> None:
     columns = {
-        "campaign": campaign,
+        "campaign": session,
         "standstill": standstill,
         "status": record.status,
         "reason": record.reason[:LONGEST],

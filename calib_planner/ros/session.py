@@ -37,9 +37,9 @@ from calib_planner.io import (
     NOT_STORED,
     OUTLIER,
     UNDONE,
-    CampaignStore,
     Record,
-    StoredCampaign,
+    SessionStore,
+    StoredSession,
     calibrated_urdf,
     write_estimate,
     write_measurements,
@@ -99,13 +99,13 @@ class Session:
         CalibPlannerError: What the store holds does not fit the robot.
     """
 
-    def __init__(self, nominal: Robot, follow: Callable[[Plan], Robot], store: CampaignStore) -> None:
+    def __init__(self, nominal: Robot, follow: Callable[[Plan], Robot], store: SessionStore) -> None:
         self.nominal, self.robot, self.follow, self.store = nominal, nominal, follow, store
         self.records: list[Record] = []
         self.newest: Estimate | TooFew | None = None
         self._unsaved: dict[int, Record] = {}
         self._others: Counter[str] = Counter()
-        self._enter(store.current() or StoredCampaign(0, "", None, ()))
+        self._enter(store.current() or StoredSession(0, "", None, ()))
 
     def begin(self, plan_id: str, plan: Plan, tolerance: float, *, keep: bool = False) -> bool:
         """Take a plan; ``False`` if it is the current one.
@@ -134,10 +134,10 @@ class Session:
         try:
             self._enter(self.store.begin(plan_id, plan, carried))
         except StoreError:
-            self._enter(replace(known or StoredCampaign(0, plan_id, plan, carried), number=0))
+            self._enter(replace(known or StoredSession(0, plan_id, plan, carried), number=0))
         return True
 
-    def _enter(self, stored: StoredCampaign) -> None:
+    def _enter(self, stored: StoredSession) -> None:
         robot = self.nominal if stored.plan is None else self.follow(stored.plan)
         self.number, self.plan_id, self.plan, self.robot = stored.number, stored.plan_id, stored.plan, robot
         self.records = [r for r in stored.records if r.status in KEPT]

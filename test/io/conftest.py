@@ -7,12 +7,12 @@ import pytest
 from stores import opened
 
 from calib_planner import Plan, PlanProblem, Robot, plan
-from calib_planner.io import CampaignStore
+from calib_planner.io import SessionStore
 from calib_planner.planning import Search
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[CampaignStore]:
+def store(tmp_path: Path) -> Iterator[SessionStore]:
     made = opened(tmp_path)
     yield made
     made.close()

@@ -9,12 +9,12 @@ import numpy as np
 
 from calib_planner import Plan
 from calib_planner.acquisition import Rejection, Standstill
-from calib_planner.io import CampaignStore, Record, StoredModel, open_store
+from calib_planner.io import Record, SessionStore, StoredModel, open_store
 
 MODEL = StoredModel("arm", ("q1", "q2"), 2, "links: [1, 0.7]  # Länge")
 
 
-def opened(folder: Path | str, model: StoredModel = MODEL, **settings: object) -> CampaignStore:
+def opened(folder: Path | str, model: StoredModel = MODEL, **settings: object) -> SessionStore:
     return open_store(str(folder), model, settings, "1.2.3")
 
 
@@ -32,7 +32,7 @@ def decision(found: Standstill | Rejection, status: str = "accepted", **others: 
     return replace(Record(found, status, "", 1, 0, frame="läser"), **others)  # type: ignore[arg-type]
 
 
-def begun(store: CampaignStore, plan_id: str = "p", planned: Plan | None = None) -> int:
+def begun(store: SessionStore, plan_id: str = "p", planned: Plan | None = None) -> int:
     return store.begin(plan_id, planned).number
 
 

@@ -15,7 +15,7 @@ from stores import MODEL, assert_same, begun, decision, opened, standstill
 from calib_planner import Plan, Robot
 from calib_planner.acquisition import Rejection, RejectionReason, Standstill
 from calib_planner.errors import FileFormatError, InputError, StoreError
-from calib_planner.io import LONGEST, CampaignStore, StoredModel, UnavailableStore, open_journal, stored_model
+from calib_planner.io import LONGEST, SessionStore, StoredModel, UnavailableStore, open_journal, stored_model
 from calib_planner.io import store as store_file
 from calib_planner.io.store import FILE, MIGRATIONS
 
@@ -56,7 +56,7 @@ def test_what_was_written_comes_back_to_the_bit(tmp_path: Path, planned: Plan) -
         assert np.array_equal(x, y, equal_nan=True) if isinstance(x, np.ndarray) else x == y or x != x, name
 
 
-def test_the_last_decision_counts_and_all_stay(store: CampaignStore) -> None:
+def test_the_last_decision_counts_and_all_stay(store: SessionStore) -> None:
     campaign = begun(store)
     first, second = (decision(standstill(k)) for k in (1, 2))
     first = replace(first, number=store.record(campaign, first))
@@ -77,7 +77,7 @@ def test_the_last_decision_counts_and_all_stay(store: CampaignStore) -> None:
     ]
 
 
-def test_texts_from_the_wire_are_bounded(store: CampaignStore) -> None:
+def test_texts_from_the_wire_are_bounded(store: SessionStore) -> None:
     campaign = begun(store)
     store.record(campaign, decision(standstill(1), frame="f" * 10**6, reason="r" * 10**6))
     found = store.current()
@@ -87,7 +87,7 @@ def test_texts_from_the_wire_are_bounded(store: CampaignStore) -> None:
         store.begin("p" * 10**6, None)
 
 
-def test_sql_in_texts_is_text(store: CampaignStore) -> None:
+def test_sql_in_texts_is_text(store: SessionStore) -> None:
     evil = "'); DROP TABLE decisions; --\0"
     campaign = begun(store, evil)
     store.record(campaign, decision(standstill(1), frame=evil, reason=evil))
@@ -98,7 +98,7 @@ def test_sql_in_texts_is_text(store: CampaignStore) -> None:
 # ── plans come and go ────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_plan_that_comes_back_finds_its_measurements(store: CampaignStore, planned: Plan) -> None:
+def test_a_plan_that_comes_back_finds_its_measurements(store: SessionStore, planned: Plan) -> None:
     first = begun(store, "a", planned)
     store.record(first, decision(standstill(1)))
     second = begun(store, "b", planned)
@@ -109,7 +109,7 @@ def test_a_plan_that_comes_back_finds_its_measurements(store: CampaignStore, pla
     assert back.number == first and len(back.records) == 1
 
 
-def test_another_plan_of_the_same_name_is_refused(store: CampaignStore, planned: Plan) -> None:
+def test_another_plan_of_the_same_name_is_refused(store: SessionStore, planned: Plan) -> None:
     campaign = begun(store, "a", planned)
     other = replace(planned, configurations=planned.configurations + 1e-12)
     for wrong in (other, None):
@@ -119,7 +119,7 @@ def test_another_plan_of_the_same_name_is_refused(store: CampaignStore, planned:
     assert found is not None and found.number == campaign
 
 
-def test_a_restarted_campaign_keeps_the_old_one(store: CampaignStore, planned: Plan) -> None:
+def test_a_restarted_campaign_keeps_the_old_one(store: SessionStore, planned: Plan) -> None:
     first = begun(store, "a", planned)
     number = store.record(first, decision(standstill(1)))
     assert store.restart("a", planned).number != first
@@ -130,7 +130,7 @@ def test_a_restarted_campaign_keeps_the_old_one(store: CampaignStore, planned: P
     assert store.begin("a", planned).number == found.number
 
 
-def test_a_new_plan_can_take_measurements_over(store: CampaignStore, planned: Plan) -> None:
+def test_a_new_plan_can_take_measurements_over(store: SessionStore, planned: Plan) -> None:
     first = begun(store, "a", planned)
     kept = decision(standstill(1))
     kept = replace(kept, number=store.record(first, kept), index=3, repetition=2)
@@ -140,7 +140,7 @@ def test_a_new_plan_can_take_measurements_over(store: CampaignStore, planned: Pl
     assert_same(found.records[0], kept)
 
 
-def test_plans_by_the_thousand_leave_no_trace(store: CampaignStore, planned: Plan) -> None:
+def test_plans_by_the_thousand_leave_no_trace(store: SessionStore, planned: Plan) -> None:
     for k in range(300):
         begun(store, f"plan {k}", planned)
     count = store._one("SELECT COUNT(*) FROM campaigns")
@@ -287,7 +287,7 @@ def test_damage_is_found_on_opening(tmp_path: Path) -> None:
     assert refused >= 15
 
 
-def test_two_processes_cannot_share_a_folder(tmp_path: Path, store: CampaignStore) -> None:
+def test_two_processes_cannot_share_a_folder(tmp_path: Path, store: SessionStore) -> None:
     with pytest.raises(InputError, match="another process uses"):
         opened(tmp_path)
     store.record(begun(store), decision(standstill(1)))

@@ -18,11 +18,11 @@ from stores import assert_same, begun, decision, opened, standstill
 
 from calib_planner import Plan
 from calib_planner.errors import StoreError
-from calib_planner.io import LONGEST, CampaignStore
+from calib_planner.io import LONGEST, SessionStore
 from calib_planner.io.store import FILE
 
 
-def test_a_full_database_changes_nothing_and_recovers(store: CampaignStore) -> None:
+def test_a_full_database_changes_nothing_and_recovers(store: SessionStore) -> None:
     campaign = begun(store)
     kept = store.record(campaign, decision(standstill(1)))
     pages = store._database.execute("PRAGMA page_count").fetchone()[0]
@@ -39,7 +39,7 @@ def test_a_full_database_changes_nothing_and_recovers(store: CampaignStore) -> N
     assert store.record(campaign, decision(standstill(2))) == kept + 1
 
 
-def test_a_read_only_disk_changes_nothing_and_recovers(store: CampaignStore, planned: Plan) -> None:
+def test_a_read_only_disk_changes_nothing_and_recovers(store: SessionStore, planned: Plan) -> None:
     campaign = begun(store)
     number = store.record(campaign, decision(standstill(1)))
     store._database.execute("PRAGMA query_only = ON")  # answers as a file system mounted read-only does
@@ -96,7 +96,7 @@ def test_writes_that_the_system_refuses(tmp_path: Path) -> None:
     assert found is not None and [d.number for d in found.records] == kept
 
 
-def test_a_file_that_is_taken_away_is_noticed(tmp_path: Path, store: CampaignStore) -> None:
+def test_a_file_that_is_taken_away_is_noticed(tmp_path: Path, store: SessionStore) -> None:
     campaign = begun(store)
     (tmp_path / FILE).rename(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match="put it back"):

@@ -22,7 +22,7 @@ from robots import plan_of, random_configurations
 from calib_planner import Estimate, Plan, Robot
 from calib_planner.acquisition import NANO, Rejection, RejectionReason, Standstill
 from calib_planner.errors import InputError, StoreError
-from calib_planner.io import NOT_STORED, CampaignStore, StoredModel, UnavailableStore, open_store
+from calib_planner.io import NOT_STORED, SessionStore, StoredModel, UnavailableStore, open_store
 from calib_planner.ros.session import MOST_REJECTIONS, Matching, Session, condition_of
 from calib_planner.simulation import random_deviations
 
@@ -39,11 +39,11 @@ def planned(count: int = 12, seed: int = 0) -> Plan:
 PLAN = planned()
 
 
-def opened(folder: Path | str) -> CampaignStore:
+def opened(folder: Path | str) -> SessionStore:
     return open_store(str(folder), StoredModel(ROBOT.name, ROBOT.joint_names, 1, "text"), {}, "")
 
 
-def begun(store: CampaignStore, plan: Plan | None = PLAN) -> Session:
+def begun(store: SessionStore, plan: Plan | None = PLAN) -> Session:
     made = Session(ROBOT, LEVELS["same"], store)
     if plan is not None:
         made.begin("p", plan, HOW.tolerance)

@@ -11,7 +11,7 @@ import pytest
 from calib_planner import Estimate, Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import Standstill, StandstillDetector
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
-from calib_planner.io import CampaignStore, StoredModel, open_store
+from calib_planner.io import SessionStore, StoredModel, open_store
 from calib_planner.planning import Search
 from calib_planner.ros import session as saving
 from calib_planner.ros.session import Matching, Session, TooFew
@@ -58,7 +58,7 @@ def campaign(robot: Robot, planned: Plan) -> Session:
     return made
 
 
-def memory(robot: Robot) -> CampaignStore:
+def memory(robot: Robot) -> SessionStore:
     return open_store("", StoredModel(robot.name, robot.joint_names, len(robot.targets), ""), {}, "")
 
 
