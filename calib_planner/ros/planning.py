@@ -7,7 +7,7 @@ be the node's own or a shipped one (never a path), and sizes are bounded.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,7 @@ from calib_planner.ros.settings import PlannerParameters, PlanParameters, unknow
 from calib_planner.units import brief, cut
 
 MOST_PARAMETERS = 1000
-SMALLEST_SIGMA = 1e-9
-"""As of the node's parameter [m]: far below any instrument, far above what underflows when squared."""
+RANGES = {item.name: item.metadata for item in fields(PlannerParameters)}
 MOST_COORDINATES = 3000
 """Configurations times joints: the search holds a square matrix of that size (100 MB with its copies)."""
 FIELD_OF = {"weights": "test_pose_weights"}
@@ -101,12 +100,6 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
     if size * len(robot.joint_names) > MOST_COORDINATES:
         most = f"at most {MOST_COORDINATES // len(robot.joint_names)} for {len(robot.joint_names)} joints"
         raise InputError("configurations", size, most)
-    limit = float(request.time_limit)
-    if not 0 <= limit <= 86400.0:
-        raise InputError("time_limit", limit, "0 (the node's default) to 86400 s")
-    sigma = float(request.sigma)
-    if not (sigma == 0 or SMALLEST_SIGMA <= sigma <= 1.0):
-        raise InputError("sigma", sigma, f"0 (the node's default), or {SMALLEST_SIGMA:g} to 1 m")
     criterion = request.criterion or settings.criterion
     candidates = _candidates(request, settings, robot)
     return PlanProblem(
@@ -115,13 +108,26 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         size,
         repetitions=int(request.repetitions) or settings.repetitions,
         weights=_weights(request),
-        noise=sigma or settings.sigma,
+        noise=_number(request, settings, "sigma"),
         criterion=criterion,
         constraints=constraints_of(settings, robot),
         discrepancy=usual_discrepancy(robot, criterion, candidates),
-        search=Search(starts=settings.starts, seed=int(request.seed), time_limit=limit or settings.time_limit),
+        search=Search(
+            starts=settings.starts, seed=int(request.seed), time_limit=_number(request, settings, "time_limit")
+        ),
         candidates=candidates,
     )
+
+
+def _number(request: Any, settings: PlannerParameters, name: str) -> float:
+    """A number of the request, in the range of the node's parameter of that name; for 0 the parameter's value."""
+    value = float(getattr(request, name))
+    if value == 0:
+        return float(getattr(settings, name))
+    low, high, unit = (RANGES[name][key] for key in ("low", "high", "unit"))
+    if not low <= value <= high:
+        raise InputError(name, value, f"0 (the node's default), or {low:g} to {high:.15g} {unit}")
+    return value
 
 
 def constraints_of(settings: PlanParameters, robot: Robot) -> tuple[Constraint, ...]:
