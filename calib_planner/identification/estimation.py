@@ -1,82 +1,327 @@
 """Identification with one error model: from measurements to parameters, coefficients and scales.
 
-    1. Base and targets, where they are unknown, start in closed form (``registration``).
-    2. Linearise at the current values, (M1); the scales maximise the restricted likelihood times their priors;
-       generalised least squares gives the parameters and the coefficients of gravity and joint functions
-       (``likelihood``). Repeat until the predictions stand still.
+    1. start      Base and targets, where they are unknown, in closed form (``registration``), then generalised
+                  least squares at typical scales until the predictions stand still.
+    2. scales     Linearise at the current values, (M1); the scales maximise the restricted likelihood times their
+                  priors (``likelihood``); generalised least squares gives parameters and coefficients. Repeat.
+    3. doubt      Where points are impossible, Student weights find who is wrong, and these alone stay inflated
+                  (``inflation``).
+    4. terms      A term that does not better the left-out score goes (``left_out``).
+    5. all        Many points: 1 to 4 are done with some of the visits, and generalised least squares at the scales
+                  found with all of them.
+
+The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_planner._arrays import FloatArray
+from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
+from calib_planner.identification.inflation import Inflation, impossible, student, suspicious
+from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import LinearProblem, Solution, maximise, solve
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.registration import register
 from calib_planner.robot.chain import Robot
 
-ROUNDS = 5
-"""Most relinearisations."""
+MOST_STARTS = 20
+"""Most relinearisations at typical scales."""
+MOST_ROUNDS = 6
+"""Most relinearisations with new scales."""
+STUDENT_ROUNDS = 12
+"""Most rounds of Student weights."""
+STILL = 1e-3
+"""Predictions that move by less than this share of a point's standard deviation stand still."""
+ENOUGH = 450
+"""Coordinates from which scales and terms are decided; more visits than that do not take part."""
+OPTIONAL = ("short", "smooth", "gravity")
+"""Terms that have to better the left-out score."""
 
 
 @dataclass(frozen=True, eq=False)
-class State:
-    """Where it is linearised.
+class TermWorth:
+    """What a term is worth.
 
     Attributes:
-        robot: With the parameters in force.
-        coefficients: (coefficients,) β: deviations from nominal, then those of the other terms.
-        model: With the scales in force.
+        name: ``placement``, ``gravity``, ``smooth``, ``short``, ``visits`` or ``points``.
+        size: Root mean square of what it moves a measured point by [m]; 0 if the term went.
+        gain: Left-out log score with it less that without; NaN where it is not asked.
+        kept: Whether it is in the model.
     """
 
-    robot: Robot
+    name: str
+    size: float
+    gain: float
+    kept: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ModelEstimate:
+    """What the measurements say.
+
+    Attributes:
+        knowledge: Robot, model with the scales found, coefficients and their covariance; it predicts.
+        left_out: (M4) of every visit.
+        inflation: Who counts less.
+        terms: Every term of the model asked for, with its size and gain.
+        solution: The last linear problem and its solution.
+        rounds: Relinearisations made.
+        converged: Whether the predictions stood still at the end.
+    """
+
+    knowledge: Knowledge
+    left_out: LeftOut
+    inflation: Inflation
+    terms: tuple[TermWorth, ...]
+    solution: Solution
+    rounds: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where it is linearised: coefficients β (coefficients,), the model's scales, who counts less."""
+
     coefficients: FloatArray
     model: ErrorModel
+    inflation: Inflation
 
 
-def start_robot(robot: Robot, data: Measurements) -> Robot:
+class _Work:
+    """The measurements, and a state that goes from one relinearisation to the next."""
+
+    def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
+        self.robot, self.data, self.load = robot, data, load
+        self.state = _State(np.zeros(len(model.names(robot))), model, Inflation.none(data.seen))
+        self.rounds, self.converged = 0, False
+
+    def linearised(self) -> LinearProblem:
+        """(M1) at the state."""
+        data, state, names = self.data, self.state, self.robot.parameter_names
+        here = self.robot.with_deviations(dict(zip(names, state.coefficients[: len(names)], strict=True)))
+        poses = Poses(here, data.q, self.load)
+        poses = replace(poses, deflection=state.model.deflection(poses, state.coefficients))
+        seen = np.repeat(data.seen, 3, axis=1).astype(float)
+        columns = state.model.columns(poses) * seen[:, :, None]
+        apart = np.where(data.seen[:, :, None], data.p - poses.points, 0.0).reshape(seen.shape)
+        random = np.isfinite(state.model.variances(self.robot))
+        parts = state.inflation.parts(self.plain_parts(poses))
+        y = apart + columns[:, :, random] @ state.coefficients[random]
+        return LinearProblem(self.robot, state.model, y, columns, parts, seen)
+
+    def plain_parts(self, poses: Poses) -> dict[str, FloatArray]:
+        """Parts of R_i, not inflated, zero where not measured."""
+        data, stated = self.data, None
+        if data.std is not None and self.state.model.points.noise is None:
+            std = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0)
+            stated = std[..., None] ** 2 * np.eye(3)
+        seen = np.repeat(data.seen, 3, axis=1).astype(float)
+        both = seen[:, :, None] * seen[:, None, :]
+        return {n: p * both for n, p in self.state.model.visit_parts(poses, stated).items()}
+
+    def plain(self) -> FloatArray:
+        """(N, m, m) R_i, not inflated."""
+        names = self.robot.parameter_names
+        deviations = dict(zip(names, self.state.coefficients[: len(names)], strict=True))
+        poses = Poses(self.robot.with_deviations(deviations), self.data.q, self.load)
+        return np.asarray(np.sum(list(self.plain_parts(poses).values()), axis=0))
+
+    def accept(self, solution: Solution) -> bool:
+        """Go to the solution; whether the predictions stood still."""
+        problem, old = solution.problem, self.state.coefficients
+        new = solution.coefficients.copy()
+        new[problem.flat] += old[problem.flat]
+        change = problem.columns @ (new - old)
+        std = np.sqrt(np.diagonal(problem.covariance, axis1=1, axis2=2))
+        self.state = replace(self.state, coefficients=new, model=problem.model)
+        self.rounds += 1
+        self.converged = bool((np.abs(change) <= STILL * std).all())
+        return self.converged
+
+    def settle(self, most: int, scales: int = 30) -> Solution:
+        """Relinearise until the predictions stand still; ``scales``: rounds for the scales each time."""
+        for _ in range(most):
+            problem = self.linearised()
+            solution = maximise(problem, scales) if scales else solve(problem)
+            if self.accept(solution):
+                break
+        return solution
+
+    def doubt(self, solution: Solution) -> Solution:
+        """Inflate what is impossible, and fit again."""
+        if not suspicious(solution, self.plain()):
+            return self._final_doubt(solution)
+        for _ in range(STUDENT_ROUNDS):
+            old = self.state.inflation.points
+            self.state = replace(self.state, inflation=student(solution, self.plain()))
+            solution = self.settle(1, 3)
+            if np.abs(np.log(self.state.inflation.points / old)).max() < 0.1:
+                break
+        return self._final_doubt(solution)
+
+    def _final_doubt(self, solution: Solution) -> Solution:
+        for _ in range(4):
+            old, new = self.state.inflation, impossible(solution, self.plain())
+            same = (new.doubtful == old.doubtful).all()
+            if same and (not new.doubtful.any() or np.allclose(new.points, old.points, rtol=0.5)):
+                break
+            self.state = replace(self.state, inflation=new)
+            solution = self.settle(2, 10)
+        return solution
+
+    def choose_terms(self, solution: Solution) -> tuple[Solution, dict[str, float]]:
+        """Without the terms that do not better the left-out score; term → gain."""
+        gains: dict[str, float] = {}
+        while True:
+            score = left_out(solution).score
+            trials = {t: maximise(_without(solution.problem, t), 6) for t in _optional(solution.problem.model)}
+            found = {t: score - left_out(trial).score for t, trial in trials.items()}
+            gains |= found
+            if not found or min(found.values()) > 0.0:
+                return solution, gains
+            worst = min(found, key=lambda t: found[t])
+            before = self.state
+            solution = trials[worst]
+            place = _place(before.model, solution.problem.model, self.robot)
+            self.state = replace(before, coefficients=before.coefficients[place], model=solution.problem.model)
+
+
+def estimate(
+    robot: Robot,
+    data: Measurements,
+    model: ErrorModel,
+    *,
+    load: FloatArray | None = None,
+    robust: bool = True,
+    choose: bool = True,
+) -> ModelEstimate:
+    """Identify the active parameters of ``robot`` and all else that the model has.
+
+    Args:
+        robot: Nominal. Base and targets start in closed form if all their parameters are active.
+        data: The measurements; the joint order may differ from the robot's.
+        model: The terms, with their scales before the data.
+        load: (N,) payload of each visit as a share of the largest one, or ``None``.
+        robust: Whether impossible points lose weight.
+        choose: Whether terms that do not better the left-out score go.
+
+    Raises:
+        NotEnoughDataError: Too few points to place tracker and targets.
+    """
+    data = data.in_order_of(robot.joint_names)
+    robot = _placed(robot, data)
+    some = _some(data)
+    part = data if some is None else data.select(some)
+    work = _Work(robot, part, model, load if load is None or some is None else load[some])
+    work.settle(MOST_STARTS, 0)
+    solution = work.settle(MOST_ROUNDS)
+    if robust and work.state.model.scales:
+        solution = work.doubt(solution)
+    gains: dict[str, float] = {}
+    if choose:
+        solution, gains = work.choose_terms(solution)
+        solution = work.settle(2)
+    if some is not None:
+        inflation = Inflation.none(data.seen)
+        inflation.points[some], inflation.visits[some] = work.state.inflation.points, work.state.inflation.visits
+        whole = _Work(robot, data, work.state.model, load)
+        whole.state, whole.rounds = replace(work.state, inflation=inflation), work.rounds
+        solution = whole.settle(2, 0)
+        if robust:
+            for _ in range(2):
+                whole.state = replace(whole.state, inflation=impossible(solution, whole.plain()))
+                solution = whole.settle(1, 0)
+        work = whole
+    hidden = _hidden(solution.problem)
+    known = Knowledge(robot, work.state.model, work.state.coefficients, solution.posterior(), hidden)
+    return ModelEstimate(
+        knowledge=known,
+        left_out=left_out(solution),
+        inflation=work.state.inflation,
+        terms=_worths(model, work.state, solution, gains),
+        solution=solution,
+        rounds=work.rounds,
+        converged=work.converged,
+    )
+
+
+def _placed(robot: Robot, data: Measurements) -> Robot:
+    """``robot`` with unknown base and targets where they fit the nominal chain best."""
     active = robot.parameter_names
     base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
     tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
     return register(robot, data, base=base, tool=tool)
 
 
-def linear_problem(nominal: Robot, data: Measurements, coefficients: FloatArray, model: ErrorModel) -> LinearProblem:
-    count = len(nominal.parameter_names)
-    robot = nominal.with_deviations(dict(zip(nominal.parameter_names, coefficients[:count], strict=True)))
-    readings = Poses(robot, data.q)
-    poses = Poses(robot, data.q, None, model.deflection(readings, coefficients))
-    seen = model.seen(data.seen)
-    columns = model.columns(poses) * seen[:, :, None]
-    stated = None
-    if data.std is not None:
-        std = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0)
-        stated = std[..., None] ** 2 * np.eye(3)
-    both = seen[:, :, None] * seen[:, None, :]
-    parts = {n: p * both for n, p in model.visit_parts(poses, stated).items()}
-    y = np.where(data.seen[:, :, None], data.p - poses.points, 0.0).reshape(len(data), -1)
-    random = np.isfinite(model.variances(nominal))
-    y = y + columns[:, :, random] @ coefficients[random]
-    return LinearProblem(nominal, model, y, columns, parts, seen)
+def _some(data: Measurements) -> FloatArray | None:
+    """Numbers of the visits that decide scales and terms, in their order; ``None``: all."""
+    size = 3 * data.seen.sum(axis=1)
+    if size.sum() <= ENOUGH:
+        return None
+    order = np.random.default_rng(0).permutation(len(size))
+    return np.sort(order[np.cumsum(size[order]) <= ENOUGH])
 
 
-def estimate(robot: Robot, data: Measurements, model: ErrorModel) -> tuple[Robot, FloatArray, Solution]:
-    data = data.in_order_of(robot.joint_names)
-    robot = start_robot(robot, data)
-    coefficients = np.zeros(len(model.names(robot)))
-    for _ in range(ROUNDS):
-        problem = linear_problem(robot, data, coefficients, model)
-        solution = maximise(problem)
-        model = solution.problem.model
-        new = solution.coefficients.copy()
-        new[problem.flat] += coefficients[problem.flat]
-        change = problem.columns @ (new - coefficients)
-        coefficients = new
-        if np.abs(change).max() < 1e-7:
-            break
-    return robot, coefficients, solution
+def _optional(model: ErrorModel) -> tuple[str, ...]:
+    """Terms of this model that have to better the left-out score."""
+    components = () if model.joint_functions is None else model.joint_functions.components
+    there = (*components, *(("gravity",) if model.gravity is not None else ()))
+    return tuple(t for t in OPTIONAL if t in there)
+
+
+def _place(model: ErrorModel, smaller: ErrorModel, robot: Robot) -> FloatArray:
+    """Where the coefficients of ``smaller`` are among those of ``model``."""
+    at = {name: i for i, name in enumerate(model.names(robot))}
+    return np.array([at[name] for name in smaller.names(robot)], int)
+
+
+def _without(problem: LinearProblem, term: str) -> LinearProblem:
+    """The same linear problem without a term."""
+    model = problem.model.without(term)
+    columns = problem.columns[:, :, _place(problem.model, model, problem.robot)]
+    return replace(problem, model=model, columns=columns)
+
+
+def _hidden(problem: LinearProblem) -> FloatArray:
+    """(coefficients, directions) of flat coefficients that no point shows."""
+    rows = problem.columns[:, :, problem.flat].reshape(problem.y.size, -1)
+    result = np.zeros((problem.columns.shape[2], rows.shape[1] - problem.basis.shape[1]))
+    if result.shape[1]:
+        length = np.linalg.norm(rows, axis=0)
+        length[length == 0.0] = 1.0
+        vectors = np.linalg.svd(rows / length, full_matrices=True)[2]
+        result[problem.flat] = vectors[problem.basis.shape[1] :].T / length[:, None]
+    return result
+
+
+def _worths(
+    asked: ErrorModel, state: _State, solution: Solution, gains: dict[str, float]
+) -> tuple[TermWorth, ...]:
+    """Every term asked for."""
+    problem, model = solution.problem, state.model
+    seen = max(problem.seen.sum() / 3.0, 1.0)
+    where = model.slices(problem.robot)
+    placed = where.pop("placement")
+    moved = {"placement": problem.columns[:, :, placed] @ state.coefficients[placed]}
+    for name, place in where.items():
+        moved[name] = problem.columns[:, :, place] @ state.coefficients[place]
+    sizes = {n: float(np.sqrt(np.sum(v**2) / seen)) for n, v in moved.items()}
+    visits = [p for n, p in problem.parts.items() if n in ("repeatability", "shared")]
+    points = [p for n, p in problem.parts.items() if n in ("instrument", "floor")]
+    for name, parts in (("visits", visits), ("points", points)):
+        traces = sum(np.trace(p, axis1=1, axis2=2) for p in parts)
+        sizes[name] = float(np.sqrt(np.median(traces / np.maximum(problem.seen.sum(axis=1) / 3.0, 1.0)))) if parts else 0.0
+    result = []
+    for term in asked.terms:
+        names = asked.joint_functions.components if term is asked.joint_functions else (term.name,)
+        kept = {t.name for t in model.terms} | set(model.joint_functions.components if model.joint_functions else ())
+        for name in names:
+            size = sizes.get(term.name, 0.0) if name in kept else 0.0
+            result.append(TermWorth(name, size, gains.get(name, float("nan")), name in kept))
+    return tuple(result)

@@ -151,6 +151,21 @@ class Solution:
         back = inverse.transpose(0, 2, 1) @ turned.reshape(n, m, -1)
         return back.reshape(n * m, -1)
 
+    def blocks_of(self, rows: FloatArray) -> FloatArray:
+        """P of some of the N·m coordinates: (len(rows), len(rows))."""
+        if len(self.factors) == 2:
+            return self.factors[0][np.ix_(rows, rows)]
+        inverse, white, half = self.factors
+        n, m = self.problem.y.shape
+        visits = np.unique(rows // m)
+        own = (visits[:, None] * m + np.arange(m)).ravel()
+        share = white[own] @ half
+        middle = (np.eye(len(own)) - share @ share.T).reshape(len(visits), m, -1)
+        left = inverse[visits].transpose(0, 2, 1) @ middle
+        back = inverse[visits].transpose(0, 2, 1) @ left.reshape(len(own), -1).T.reshape(len(visits), m, -1)
+        at = np.searchsorted(own, rows)
+        return back.reshape(len(own), -1).T[np.ix_(at, at)]
+
     def posterior(self) -> FloatArray:
         """(coefficients, coefficients) covariance C of β given the data, (M2); zero in directions no point shows."""
         problem = self.problem
