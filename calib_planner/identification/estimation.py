@@ -25,7 +25,14 @@ from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
 from calib_planner.identification.inflation import Inflation, impossible, student, suspicious
 from calib_planner.identification.left_out import LeftOut, left_out
-from calib_planner.identification.likelihood import LinearProblem, Solution, maximise, solve
+from calib_planner.identification.likelihood import (
+    LinearProblem,
+    Solution,
+    maximise,
+    scale_covariance,
+    solve,
+    with_uncertain_scales,
+)
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.registration import register
 from calib_planner.robot.chain import Robot
@@ -227,6 +234,7 @@ def estimate(
     if choose:
         solution, gains = work.choose_terms(solution)
         solution = work.settle(2)
+    scales = scale_covariance(solution)
     if some is not None:
         inflation = Inflation.none(data.seen)
         inflation.points[some], inflation.visits[some] = work.state.inflation.points, work.state.inflation.visits
@@ -238,8 +246,8 @@ def estimate(
                 whole.state = replace(whole.state, inflation=impossible(solution, whole.plain()))
                 solution = whole.settle(1, 0)
         work = whole
-    hidden = _hidden(solution.problem)
-    known = Knowledge(robot, work.state.model, work.state.coefficients, solution.posterior(), hidden)
+    hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
+    known = Knowledge(robot, work.state.model, work.state.coefficients, covariance, hidden)
     return ModelEstimate(
         knowledge=known,
         left_out=left_out(solution),

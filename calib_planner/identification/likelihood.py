@@ -32,10 +32,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
-from calib_planner._arrays import FloatArray
+from calib_planner._arrays import FloatArray, IntArray
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.robot.chain import Robot
 
@@ -68,12 +67,12 @@ class LinearProblem:
     seen: FloatArray
 
     @cached_property
-    def flat(self) -> FloatArray:
+    def flat(self) -> IntArray:
         """Numbers of the coefficients without a prior."""
         return np.flatnonzero(np.isinf(self.model.variances(self.robot)))
 
     @cached_property
-    def random(self) -> FloatArray:
+    def random(self) -> IntArray:
         """Numbers of the coefficients with one."""
         return np.flatnonzero(np.isfinite(self.model.variances(self.robot)))
 
@@ -99,6 +98,28 @@ class LinearProblem:
     def random_columns(self) -> FloatArray:
         """(N·m, K) B."""
         return np.ascontiguousarray(self.columns[:, :, self.random].reshape(self.y.size, -1))
+
+    @cached_property
+    def scaled_columns(self) -> FloatArray:
+        """(N·m, K) B Λ^½."""
+        return self.random_columns * np.sqrt(self.model.variances(self.robot)[self.random])
+
+    @cached_property
+    def ratios(self) -> dict[str, FloatArray]:
+        """Scale that the data decide → (K,) ∂ log λ_k by its logarithm."""
+        variances = self.model.variances(self.robot)[self.random]
+        slopes = {name: slope[self.random] for name, slope in self.model.slopes(self.robot).items()}
+        zero = np.zeros(len(variances))
+        return {n: np.divide(s, variances, out=zero.copy(), where=variances > 1e-290) for n, s in slopes.items()}
+
+    @cached_property
+    def turn(self) -> FloatArray:
+        """(coefficients, rank + K): β of γ and Λ^-½ u."""
+        rank = self.basis.shape[1]
+        result = np.zeros((self.columns.shape[2], rank + len(self.random)))
+        result[self.flat, :rank] = self.basis
+        result[np.ix_(self.random, range(rank, result.shape[1]))] = np.diag(np.sqrt(self.model.variances(self.robot)[self.random]))
+        return result
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -128,7 +149,6 @@ class Solution:
         blocks: (N, m, m) P_ii [1/m²].
         squares: (K,) λ_k b_kᵀ P b_k.
         pulls: (K,) λ_k^½ b_kᵀ P y.
-        factors: What ``project`` and ``posterior`` need.
     """
 
     problem: LinearProblem
@@ -138,56 +158,89 @@ class Solution:
     blocks: FloatArray
     squares: FloatArray
     pulls: FloatArray
-    factors: tuple[FloatArray, ...]
 
     def project(self, vectors: FloatArray) -> FloatArray:
         """P · vectors, (N·m, n) → (N·m, n)."""
-        if len(self.factors) == 2:
-            return self.factors[0] @ vectors
-        inverse, white, half = self.factors
-        n, m = self.problem.y.shape
-        turned = (inverse @ vectors.reshape(n, m, -1)).reshape(n * m, -1)
-        turned = turned - white @ (half @ (half.T @ (white.T @ turned)))
-        back = inverse.transpose(0, 2, 1) @ turned.reshape(n, m, -1)
-        return back.reshape(n * m, -1)
+        raise NotImplementedError
 
-    def blocks_of(self, rows: FloatArray) -> FloatArray:
+    def blocks_of(self, rows: IntArray) -> FloatArray:
         """P of some of the N·m coordinates: (len(rows), len(rows))."""
-        if len(self.factors) == 2:
-            return self.factors[0][np.ix_(rows, rows)]
-        inverse, white, half = self.factors
-        n, m = self.problem.y.shape
-        visits = np.unique(rows // m)
-        own = (visits[:, None] * m + np.arange(m)).ravel()
-        share = white[own] @ half
-        middle = (np.eye(len(own)) - share @ share.T).reshape(len(visits), m, -1)
-        left = inverse[visits].transpose(0, 2, 1) @ middle
-        back = inverse[visits].transpose(0, 2, 1) @ left.reshape(len(own), -1).T.reshape(len(visits), m, -1)
-        at = np.searchsorted(own, rows)
-        return back.reshape(len(own), -1).T[np.ix_(at, at)]
+        raise NotImplementedError
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        """γ̂ and Λ^-½ û if ``vectors`` (N·m, n) had been measured: (rank + K, n)."""
+        raise NotImplementedError
+
+    def _reduced_covariance(self) -> FloatArray:
+        """(rank + K, rank + K) of γ and Λ^-½ u."""
+        raise NotImplementedError
+
+    def coefficients_of(self, vectors: FloatArray) -> FloatArray:
+        """β if ``vectors`` (N·m, n) had been measured: (coefficients, n)."""
+        return self.problem.turn @ self._reduced(vectors)
 
     def posterior(self) -> FloatArray:
         """(coefficients, coefficients) covariance C of β given the data, (M2); zero in directions no point shows."""
-        problem = self.problem
-        flat, random, basis = problem.flat, problem.random, problem.basis
-        root = np.sqrt(problem.model.variances(problem.robot)[random])
-        size, rank = len(flat) + len(random), basis.shape[1]
-        if len(self.factors) == 2:
-            projection, spread = self.factors
-            scaled = problem.random_columns * root
-            inner = spread @ problem.flat_columns.T @ self._weigh(scaled)
-            small = np.block([[spread, -inner], [-inner.T, np.eye(len(random)) - scaled.T @ projection @ scaled]])
-        else:
-            small = self.factors[2] @ self.factors[2].T
-        turn = np.zeros((size, rank + len(random)))
-        turn[flat, :rank] = basis
-        turn[random, rank + np.arange(len(random))] = root
-        return turn @ small @ turn.T
+        turn = self.problem.turn
+        return turn @ self._reduced_covariance() @ turn.T
 
-    def _weigh(self, vectors: FloatArray) -> FloatArray:
-        """V⁻¹ · vectors in the dense form: V is made anew, since only P was kept."""
-        total, _ = _dense_covariance(self.problem)
-        return np.asarray(cho_solve(cho_factor(total, lower=True), vectors))
+
+@dataclass(frozen=True, eq=False)
+class DenseSolution(Solution):
+    """By (1): ``projection`` P, ``spread`` S⁻¹ and ``carried`` V⁻¹F."""
+
+    projection: FloatArray
+    spread: FloatArray
+    carried: FloatArray
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        return self.projection @ vectors
+
+    def blocks_of(self, rows: IntArray) -> FloatArray:
+        return self.projection[np.ix_(rows, rows)]
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        flat = self.spread @ (self.carried.T @ vectors)
+        return np.vstack([flat, self.problem.scaled_columns.T @ (self.projection @ vectors)])
+
+    def _reduced_covariance(self) -> FloatArray:
+        scaled = self.problem.scaled_columns
+        cross = -self.spread @ (self.carried.T @ scaled)
+        own = np.eye(scaled.shape[1]) - scaled.T @ self.projection @ scaled
+        return np.block([[self.spread, cross], [cross.T, own]])
+
+
+@dataclass(frozen=True, eq=False)
+class CoefficientSolution(Solution):
+    """By (3): ``inverse`` (N, m, m) of R_i = L Lᵀ, ``white`` (N·m, rank + K) L⁻¹W, ``half`` with A⁻¹ = half halfᵀ."""
+
+    inverse: FloatArray
+    white: FloatArray
+    half: FloatArray
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        n, m = self.problem.y.shape
+        turned = (self.inverse @ vectors.reshape(n, m, -1)).reshape(n * m, -1)
+        turned = turned - self.white @ (self.half @ (self.half.T @ (self.white.T @ turned)))
+        return (self.inverse.transpose(0, 2, 1) @ turned.reshape(n, m, -1)).reshape(n * m, -1)
+
+    def blocks_of(self, rows: IntArray) -> FloatArray:
+        m = self.problem.y.shape[1]
+        visits = np.unique(rows // m)
+        own = (visits[:, None] * m + np.arange(m)).ravel()
+        lower = block_diagonal(self.inverse[visits])
+        share = self.white[own] @ self.half
+        block = lower.T @ (lower - share @ (share.T @ lower))
+        at = np.searchsorted(own, rows)
+        return np.asarray(block[np.ix_(at, at)])
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        n, m = self.problem.y.shape
+        turned = (self.inverse @ vectors.reshape(n, m, -1)).reshape(n * m, -1)
+        return np.asarray(self.half @ (self.half.T @ (self.white.T @ turned)))
+
+    def _reduced_covariance(self) -> FloatArray:
+        return np.asarray(self.half @ self.half.T)
 
 
 def solve(problem: LinearProblem) -> Solution:
@@ -196,60 +249,50 @@ def solve(problem: LinearProblem) -> Solution:
     return dense(problem) if coordinates <= coefficients else by_coefficients(problem)
 
 
-def _dense_covariance(problem: LinearProblem) -> tuple[FloatArray, FloatArray]:
-    """V (N·m, N·m) and B Λ^½ (N·m, K)."""
-    n, m = problem.y.shape
-    scaled = problem.random_columns * np.sqrt(problem.model.variances(problem.robot)[problem.random])
-    total = scaled @ scaled.T
-    every = np.arange(n)
-    total.reshape(n, m, n, m)[every, :, every, :] += problem.covariance
-    return total, scaled
-
-
-def dense(problem: LinearProblem) -> Solution:
+def dense(problem: LinearProblem) -> DenseSolution:
     """By factorising V, (1)."""
     n, m = problem.y.shape
-    y, flat = problem.y.ravel(), problem.flat_columns
-    total, scaled = _dense_covariance(problem)
+    y, flat, scaled = problem.y.ravel(), problem.flat_columns, problem.scaled_columns
+    every = np.arange(n)
+    total = scaled @ scaled.T
+    total.reshape(n, m, n, m)[every, :, every, :] += problem.covariance
     factor = np.linalg.cholesky(total)
     half, _ = dpotri(factor, lower=1)
     inverse = np.tril(half) + np.tril(half, -1).T
-    weighted = inverse @ flat
-    normal = flat.T @ weighted
+    carried = inverse @ flat
+    normal = flat.T @ carried
     spread = _inverse(normal)
-    projection = inverse - weighted @ spread @ weighted.T
+    projection = inverse - carried @ spread @ carried.T
     pulled = projection @ y
     value = 2.0 * np.log(np.diag(factor)).sum() + np.linalg.slogdet(normal)[1] + y @ pulled
-    every = np.arange(n)
-    squares = np.einsum("ak,ak->k", scaled, projection @ scaled)
     pulls = scaled.T @ pulled
-    return Solution(
+    return DenseSolution(
         problem,
         float(value),
-        _coefficients(problem, spread @ (weighted.T @ y), pulls),
+        problem.turn @ np.append(spread @ (carried.T @ y), pulls),
         pulled.reshape(n, m),
         projection.reshape(n, m, n, m)[every, :, every, :],
-        squares,
+        np.einsum("ak,ak->k", scaled, projection @ scaled),
         pulls,
-        (projection, spread),
+        projection,
+        spread,
+        carried,
     )
 
 
-def by_coefficients(problem: LinearProblem) -> Solution:
+def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
     """By factorising A, (3)."""
     n, m = problem.y.shape
-    root = np.sqrt(problem.model.variances(problem.robot)[problem.random])
     rank = problem.flat_columns.shape[1]
     lower = np.linalg.cholesky(problem.covariance)
     inverse = np.linalg.inv(lower)
-    columns = np.hstack([problem.flat_columns, problem.random_columns * root])
+    columns = np.hstack([problem.flat_columns, problem.scaled_columns])
     white = (inverse @ columns.reshape(n, m, -1)).reshape(n * m, -1)
     right = (inverse @ problem.y[:, :, None]).ravel()
     normal = white.T @ white
-    normal[np.diag_indices(len(normal))] += np.append(np.zeros(rank), np.ones(len(root)))
+    normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
     scale = 1.0 / np.sqrt(np.diag(normal))
     factor = np.linalg.cholesky(normal * np.outer(scale, scale))
-    # A⁻¹ = half halfᵀ
     half = scale[:, None] * np.linalg.inv(factor).T
     solution = half @ (half.T @ (white.T @ right))
     rest = right - white @ solution
@@ -257,26 +300,26 @@ def by_coefficients(problem: LinearProblem) -> Solution:
     value += 2.0 * (np.log(np.diag(factor)) - np.log(scale)).sum() + right @ rest
     share = (white @ half).reshape(n, m, -1)
     transposed = inverse.transpose(0, 2, 1)
-    blocks = transposed @ (np.eye(m) - share @ share.transpose(0, 2, 1)) @ inverse
-    return Solution(
+    return CoefficientSolution(
         problem,
         float(value),
-        _coefficients(problem, solution[:rank], solution[rank:]),
+        problem.turn @ solution,
         (transposed @ rest.reshape(n, m, 1))[:, :, 0],
-        blocks,
+        transposed @ (np.eye(m) - share @ share.transpose(0, 2, 1)) @ inverse,
         1.0 - np.sum(half[rank:] ** 2, axis=1),
         solution[rank:],
-        (inverse, white, half),
+        inverse,
+        white,
+        half,
     )
 
 
-def _coefficients(problem: LinearProblem, flat: FloatArray, pulls: FloatArray) -> FloatArray:
-    """β of γ̂ and Λ^-½ û."""
-    result = np.zeros(problem.columns.shape[2])
-    result[problem.flat] = problem.basis @ flat
-    root = np.sqrt(problem.model.variances(problem.robot)[problem.random])
-    result[problem.random] = root * pulls
-    return result
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """(N, m, m) → (N·m, N·m)."""
+    n, m, _ = blocks.shape
+    result = np.zeros((n, m, n, m))
+    result[np.arange(n), :, np.arange(n), :] = blocks
+    return result.reshape(n * m, n * m)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
@@ -308,9 +351,6 @@ def penalty(model: ErrorModel, names: tuple[str, ...]) -> tuple[float, FloatArra
 def derivatives(solution: Solution, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
     """Gradient of −2 log L by the logarithms of the scales, and its average information (scales, scales)."""
     problem = solution.problem
-    slopes = problem.model.slopes(problem.robot)
-    variances = problem.model.variances(problem.robot)[problem.random]
-    root = np.sqrt(variances)
     gradient, pushes = np.zeros(len(names)), np.zeros((problem.y.size, len(names)))
     for at, name in enumerate(names):
         if name in problem.parts:
@@ -318,12 +358,47 @@ def derivatives(solution: Solution, names: tuple[str, ...]) -> tuple[FloatArray,
             push = (part @ solution.weighted[:, :, None])[:, :, 0]
             gradient[at] += np.sum(part * solution.blocks) - np.sum(push * solution.weighted)
             pushes[:, at] += push.ravel()
-        if name in slopes:
-            slope = slopes[name][problem.random]
-            ratio = np.divide(slope, variances, out=np.zeros(len(slope)), where=variances > 1e-290)
+        ratio = problem.ratios.get(name)
+        if ratio is not None:
             gradient[at] += ratio @ (solution.squares - solution.pulls**2)
-            pushes[:, at] += problem.random_columns @ (root * ratio * solution.pulls)
+            pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
     return gradient, pushes.T @ solution.project(pushes)
+
+
+def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], FloatArray]) -> FloatArray:
+    """C of β, with what the uncertainty of the scales adds (Kackar & Harville 1984): C + D cov(log θ) Dᵀ.
+
+    D = ∂β̂/∂log θ: of γ̂ and û = Λ Bᵀ P y, with ∂P = −P ∂V P, it is −β̂(∂V P y), β̂(·) being the estimate from
+    other measurements, plus ∂Λ Bᵀ P y.
+
+    Args:
+        solution: At the scales found.
+        scales: Their names, and cov(log θ) as ``scale_covariance`` has it.
+    """
+    problem, (names, covariance) = solution.problem, scales
+    result = solution.posterior()
+    if not names:
+        return result
+    pushes, direct = np.zeros((problem.y.size, len(names))), np.zeros((len(result), len(names)))
+    for at, name in enumerate(names):
+        if name in problem.parts:
+            pushes[:, at] += 2.0 * (problem.parts[name] @ solution.weighted[:, :, None]).ravel()
+        ratio = problem.ratios.get(name)
+        if ratio is not None:
+            pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
+            direct[problem.random, at] = ratio * solution.coefficients[problem.random]
+    slope = direct - solution.coefficients_of(pushes)
+    return np.asarray(result + slope @ covariance @ slope.T)
+
+
+def scale_covariance(solution: Solution) -> tuple[tuple[str, ...], FloatArray]:
+    """Names of the scales that the data decide, and the covariance of their logarithms."""
+    problem = solution.problem
+    names = unknown_scales(problem.model, problem.parts, problem.robot)
+    if not names:
+        return names, np.zeros((0, 0))
+    information = derivatives(solution, names)[1] + np.diag(penalty(problem.model, names)[2])
+    return names, 2.0 * np.linalg.inv(information)
 
 
 def maximise(problem: LinearProblem, rounds: int = 30) -> Solution:
