@@ -98,6 +98,10 @@ class Gravity:
         """K names ``gravity.<mass>.<joint>``, mass by mass, for the joints that carry it."""
         return tuple(f"gravity.{mass}.{robot.joint_names[j]}" for mass, j in self._pairs(robot))
 
+    def size(self, robot: Robot) -> int:
+        """K."""
+        return len(self._pairs(robot))
+
     def columns(self, poses: Poses) -> FloatArray:
         """(N, 3·targets, K) c_l τ_lm [m per rad/m]."""
         joints = [j for _, j in self._pairs(poses.robot)]

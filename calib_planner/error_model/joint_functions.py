@@ -66,7 +66,13 @@ class JointFunctions:
     def names(self, robot: Robot) -> tuple[str, ...]:
         """K = joints · 2 · harmonics names ``<joint>.cos1 …, <joint>.sin1 …``."""
         orders = range(1, self.harmonics + 1)
-        return tuple(f"{joint}.{wave}{n}" for joint in robot.joint_names for wave in ("cos", "sin") for n in orders)
+        return tuple(
+            f"{joint}.{wave}{n}" for joint in robot.joint_names for wave in ("cos", "sin") for n in orders
+        )
+
+    def size(self, robot: Robot) -> int:
+        """K."""
+        return 2 * self.harmonics * len(robot.joint_names)
 
     def columns(self, poses: Poses) -> FloatArray:
         """(N, 3·targets, K) c_l cos n x_l and c_l sin n x_l [m/rad]."""

@@ -31,6 +31,11 @@ from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.instrument.noise import Isotropic, Noise
 from calib_planner.robot.chain import Robot
 
+UNKNOWN_SIGMA = 1e-4
+"""Standard deviation of a coordinate to begin with where nothing is known of it [m]."""
+NOTHING_KNOWN = 1e300
+"""Factor of a scale of which nothing is known."""
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -72,7 +77,7 @@ class ErrorModel:
         joint_functions: Errors of the transmissions, or ``None``.
         visits: What is new at each visit, or ``None``.
         points: What is new at each point.
-        scales: Exactly those that the terms use.
+        scales: Exactly those that the terms use, in their order; others are dropped.
         name: ``typical``, ``paper``, ``estimated`` or the user's word.
     """
 
@@ -90,14 +95,22 @@ class ErrorModel:
             raise InputError("error_model.scales", ", ".join(have), f"each of {', '.join(need)} once")
         if self.points.noise is None and not self.points.floor:
             raise InputError("error_model.points", "neither noise nor floor", "at least one of them")
-        object.__setattr__(self, "scales", tuple(s for s in self.scales if s.name in need))
+        by_name = {s.name: s for s in self.scales}
+        object.__setattr__(self, "scales", tuple(by_name[n] for n in need))
 
     # ── making ───────────────────────────────────────────────────────────────────────────────────────
 
     @staticmethod
-    def paper(noise: Noise | float) -> ErrorModel:
-        """The paper's: flat parameters and the same noise at every point, eqs. (6)–(15); ``noise`` may be σ [m]."""
-        stated = noise if isinstance(noise, Noise) else Isotropic(noise)
+    def paper(noise: Noise | float | None = None) -> ErrorModel:
+        """The paper's, eqs. (6)–(15): flat parameters and nothing but noise.
+
+        Args:
+            noise: The instrument, or σ of every coordinate [m]; ``None``: the residuals tell σ, and nothing else.
+        """
+        if noise is None:
+            floor = Scale("floor", UNKNOWN_SIGMA, UNKNOWN_SIGMA, NOTHING_KNOWN, "m")
+            return ErrorModel(Placement("flat"), None, None, None, Points(), (floor,), "paper")
+        stated = Isotropic(noise) if isinstance(noise, (float, int)) else noise
         points = Points(stated, floor=False)
         return ErrorModel(Placement("flat"), None, None, None, points, (), "paper")
 
@@ -143,7 +156,7 @@ class ErrorModel:
         """Term → its place among the coefficients."""
         result, start = {}, 0
         for term in self.systematic:
-            end = start + len(term.names(robot))
+            end = start + term.size(robot)
             result[term.name] = slice(start, end)
             start = end
         return result
@@ -174,9 +187,10 @@ class ErrorModel:
     def slopes(self, robot: Robot) -> dict[str, FloatArray]:
         """Scale → (coefficients,) derivative of ``variances`` by its logarithm, for scales that are not known."""
         where, result = self.slices(robot), {}
+        count = sum(term.size(robot) for term in self.systematic)
         for term in self.systematic:
             for name, slope in term.slopes(robot, self.values).items():
-                whole = np.zeros(len(self.names(robot)))
+                whole = np.zeros(count)
                 whole[where[term.name]] = slope
                 result[name] = whole
         return {s.name: result[s.name] for s in self.scales if not s.known and s.name in result}

@@ -11,6 +11,7 @@ parameters replaces the tolerance of these.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -60,6 +61,10 @@ class Placement:
         """P names, the order of the columns."""
         return robot.parameter_names
 
+    def size(self, robot: Robot) -> int:
+        """P."""
+        return len(robot.parameter_names)
+
     def columns(self, poses: Poses) -> FloatArray:
         """(N, 3·targets, P) ∂position/∂parameter [m/m | m/rad]."""
         return poses.jacobian
@@ -100,6 +105,7 @@ def is_placement(robot: Robot) -> FloatArray:
     return np.array([not n.startswith(("base.", "target_")) for n in robot.parameter_names], bool)
 
 
+@lru_cache(maxsize=64)
 def joint_zeros(robot: Robot) -> FloatArray:
     """(P,) whether a parameter acts as a joint does, wherever the robot stands.
 

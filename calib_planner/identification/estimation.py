@@ -105,7 +105,7 @@ class _Work:
 
     def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
         self.robot, self.data, self.load = robot, data, load
-        self.state = _State(np.zeros(len(model.names(robot))), model, Inflation.none(data.seen))
+        self.state = _State(np.zeros(len(model.variances(robot))), model, Inflation.none(data.seen))
         self.rounds, self.converged = 0, False
 
     def linearised(self) -> LinearProblem:
@@ -324,11 +324,15 @@ def _worths(
     points = [p for n, p in problem.parts.items() if n in ("instrument", "floor")]
     for name, parts in (("visits", visits), ("points", points)):
         traces = sum(np.trace(p, axis1=1, axis2=2) for p in parts)
-        sizes[name] = float(np.sqrt(np.median(traces / np.maximum(problem.seen.sum(axis=1) / 3.0, 1.0)))) if parts else 0.0
+        sizes[name] = (
+            float(np.sqrt(np.median(traces / np.maximum(problem.seen.sum(axis=1) / 3.0, 1.0)))) if parts else 0.0
+        )
     result = []
     for term in asked.terms:
         names = asked.joint_functions.components if term is asked.joint_functions else (term.name,)
-        kept = {t.name for t in model.terms} | set(model.joint_functions.components if model.joint_functions else ())
+        kept = {t.name for t in model.terms} | set(
+            model.joint_functions.components if model.joint_functions else ()
+        )
         for name in names:
             size = sizes.get(term.name, 0.0) if name in kept else 0.0
             result.append(TermWorth(name, size, gains.get(name, float("nan")), name in kept))

@@ -100,25 +100,28 @@ class LinearProblem:
         return np.ascontiguousarray(self.columns[:, :, self.random].reshape(self.y.size, -1))
 
     @cached_property
+    def root(self) -> FloatArray:
+        """(K,) Λ^½."""
+        return np.sqrt(self.model.variances(self.robot)[self.random])
+
+    @cached_property
     def scaled_columns(self) -> FloatArray:
         """(N·m, K) B Λ^½."""
-        return self.random_columns * np.sqrt(self.model.variances(self.robot)[self.random])
+        return self.random_columns * self.root
 
     @cached_property
     def ratios(self) -> dict[str, FloatArray]:
         """Scale that the data decide → (K,) ∂ log λ_k by its logarithm."""
-        variances = self.model.variances(self.robot)[self.random]
         slopes = {name: slope[self.random] for name, slope in self.model.slopes(self.robot).items()}
-        zero = np.zeros(len(variances))
-        return {n: np.divide(s, variances, out=zero.copy(), where=variances > 1e-290) for n, s in slopes.items()}
+        there = self.root > 1e-145
+        return {n: np.where(there, s, 0.0) / np.where(there, self.root**2, 1.0) for n, s in slopes.items()}
 
-    @cached_property
-    def turn(self) -> FloatArray:
-        """(coefficients, rank + K): β of γ and Λ^-½ u."""
+    def expand(self, reduced: FloatArray) -> FloatArray:
+        """β (coefficients, …) of γ and Λ^-½ u (rank + K, …)."""
         rank = self.basis.shape[1]
-        result = np.zeros((self.columns.shape[2], rank + len(self.random)))
-        result[self.flat, :rank] = self.basis
-        result[np.ix_(self.random, range(rank, result.shape[1]))] = np.diag(np.sqrt(self.model.variances(self.robot)[self.random]))
+        result = np.zeros((self.columns.shape[2], *reduced.shape[1:]))
+        result[self.flat] = self.basis @ reduced[:rank]
+        result[self.random] = (self.root * reduced[rank:].T).T
         return result
 
     @cached_property
@@ -177,12 +180,12 @@ class Solution:
 
     def coefficients_of(self, vectors: FloatArray) -> FloatArray:
         """β if ``vectors`` (N·m, n) had been measured: (coefficients, n)."""
-        return self.problem.turn @ self._reduced(vectors)
+        return self.problem.expand(self._reduced(vectors))
 
     def posterior(self) -> FloatArray:
         """(coefficients, coefficients) covariance C of β given the data, (M2); zero in directions no point shows."""
-        turn = self.problem.turn
-        return turn @ self._reduced_covariance() @ turn.T
+        half = self.problem.expand(self._reduced_covariance())
+        return self.problem.expand(half.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +272,7 @@ def dense(problem: LinearProblem) -> DenseSolution:
     return DenseSolution(
         problem,
         float(value),
-        problem.turn @ np.append(spread @ (carried.T @ y), pulls),
+        problem.expand(np.append(spread @ (carried.T @ y), pulls)),
         pulled.reshape(n, m),
         projection.reshape(n, m, n, m)[every, :, every, :],
         np.einsum("ak,ak->k", scaled, projection @ scaled),
@@ -303,7 +306,7 @@ def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
     return CoefficientSolution(
         problem,
         float(value),
-        problem.turn @ solution,
+        problem.expand(solution),
         (transposed @ rest.reshape(n, m, 1))[:, :, 0],
         transposed @ (np.eye(m) - share @ share.transpose(0, 2, 1)) @ inverse,
         1.0 - np.sum(half[rank:] ** 2, axis=1),
