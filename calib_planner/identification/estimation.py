@@ -4,8 +4,8 @@
                   least squares at typical scales until the predictions stand still.
     2. scales     Linearise at the current values, (M1); the scales maximise the restricted likelihood times their
                   priors (``likelihood``); generalised least squares gives parameters and coefficients. Repeat.
-    3. doubt      Where points are impossible, Student weights find who is wrong, and these alone stay inflated
-                  (``inflation``).
+    3. doubt      Where points or a run of visits are impossible beside the others, these lose their weight
+                  (``doubt``).
     4. terms      A term that does not better the left-out score goes (``left_out``).
     5. all        Many points: 1 to 4 are done with some of the visits, and generalised least squares at the scales
                   found with all of them.
@@ -23,7 +23,7 @@ from calib_planner._arrays import FloatArray
 from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
-from calib_planner.identification.inflation import Inflation, impossible, student, suspicious
+from calib_planner.identification.doubt import OUT, impossible, part_of, shifted_run, student, suspicious
 from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import (
     LinearProblem,
@@ -43,6 +43,10 @@ MOST_ROUNDS = 6
 """Most relinearisations with new scales."""
 STUDENT_ROUNDS = 12
 """Most rounds of Student weights."""
+MOST_DOUBTS = 8
+"""Most rounds in which impossible points come and go."""
+MATERIAL = 3.0
+"""A run that is shifted by fewer standard deviations of a point is left alone."""
 STILL = 1e-3
 """Predictions that move by less than this share of a point's standard deviation stand still."""
 ENOUGH = 450
@@ -75,7 +79,7 @@ class ModelEstimate:
     Attributes:
         knowledge: Robot, model with the scales found, coefficients and their covariance; it predicts.
         left_out: (M4) of every visit.
-        inflation: Who counts less.
+        doubt: (N, targets) variance of each point beside the model's [m²]; 0 where it counts in full.
         terms: Every term of the model asked for, with its size and gain.
         solution: The last linear problem and its solution.
         rounds: Relinearisations made.
@@ -84,7 +88,7 @@ class ModelEstimate:
 
     knowledge: Knowledge
     left_out: LeftOut
-    inflation: Inflation
+    doubt: FloatArray
     terms: tuple[TermWorth, ...]
     solution: Solution
     rounds: int
@@ -93,11 +97,11 @@ class ModelEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Where it is linearised: coefficients β (coefficients,), the model's scales, who counts less."""
+    """Where it is linearised: β (coefficients,), the model's scales, D of every point (N, targets)."""
 
     coefficients: FloatArray
     model: ErrorModel
-    inflation: Inflation
+    doubt: FloatArray
 
 
 class _Work:
@@ -105,7 +109,7 @@ class _Work:
 
     def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
         self.robot, self.data, self.load = robot, data, load
-        self.state = _State(np.zeros(len(model.variances(robot))), model, Inflation.none(data.seen))
+        self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
         self.rounds, self.converged = 0, False
 
     def linearised(self) -> LinearProblem:
@@ -118,26 +122,17 @@ class _Work:
         columns = state.model.columns(poses) * seen[:, :, None]
         apart = np.where(data.seen[:, :, None], data.p - poses.points, 0.0).reshape(seen.shape)
         random = np.isfinite(state.model.variances(self.robot))
-        parts = state.inflation.parts(self.plain_parts(poses))
-        y = apart + columns[:, :, random] @ state.coefficients[random]
-        return LinearProblem(self.robot, state.model, y, columns, parts, seen)
-
-    def plain_parts(self, poses: Poses) -> dict[str, FloatArray]:
-        """Parts of R_i, not inflated, zero where not measured."""
-        data, stated = self.data, None
-        if data.std is not None and self.state.model.points.noise is None:
+        stated = None
+        if data.std is not None and state.model.points.noise is None:
             std = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0)
             stated = std[..., None] ** 2 * np.eye(3)
-        seen = np.repeat(data.seen, 3, axis=1).astype(float)
+        parts = state.model.visit_parts(poses, stated)
+        if state.doubt.any():
+            parts = parts | {"doubt": part_of(state.doubt)}
         both = seen[:, :, None] * seen[:, None, :]
-        return {n: p * both for n, p in self.state.model.visit_parts(poses, stated).items()}
-
-    def plain(self) -> FloatArray:
-        """(N, m, m) R_i, not inflated."""
-        names = self.robot.parameter_names
-        deviations = dict(zip(names, self.state.coefficients[: len(names)], strict=True))
-        poses = Poses(self.robot.with_deviations(deviations), self.data.q, self.load)
-        return np.asarray(np.sum(list(self.plain_parts(poses).values()), axis=0))
+        parts = {n: p * both for n, p in parts.items()}
+        y = apart + columns[:, :, random] @ state.coefficients[random]
+        return LinearProblem(self.robot, state.model, y, columns, parts, seen)
 
     def accept(self, solution: Solution) -> bool:
         """Go to the solution; whether the predictions stood still."""
@@ -161,26 +156,43 @@ class _Work:
         return solution
 
     def doubt(self, solution: Solution) -> Solution:
-        """Inflate what is impossible, and fit again."""
-        if not suspicious(solution, self.plain()):
-            return self._final_doubt(solution)
-        for _ in range(STUDENT_ROUNDS):
-            old = self.state.inflation.points
-            self.state = replace(self.state, inflation=student(solution, self.plain()))
-            solution = self.settle(1, 3)
-            if np.abs(np.log(self.state.inflation.points / old)).max() < 0.1:
+        """Take the weight of what is impossible, and fit again."""
+        solution, run = self._shifted(solution)
+        if suspicious(solution, self.state.doubt):
+            for _ in range(STUDENT_ROUNDS):
+                old = self.state.doubt
+                new = np.maximum(student(solution, old), run)
+                self.state = replace(self.state, doubt=new)
+                solution = self.settle(1, 3)
+                own = np.trace(solution.problem.covariance, axis1=1, axis2=2).min() / new.shape[1]
+                if np.abs(np.log((new + own) / (old + own))).max() < 0.1:
+                    break
+        for _ in range(MOST_DOUBTS):
+            old = self.state.doubt
+            new = np.maximum(impossible(solution, old), run)
+            if ((new > 0) == (old > 0)).all() and (new <= 2.0 * old).all():
                 break
-        return self._final_doubt(solution)
-
-    def _final_doubt(self, solution: Solution) -> Solution:
-        for _ in range(4):
-            old, new = self.state.inflation, impossible(solution, self.plain())
-            same = (new.doubtful == old.doubtful).all()
-            if same and (not new.doubtful.any() or np.allclose(new.points, old.points, rtol=0.5)):
-                break
-            self.state = replace(self.state, inflation=new)
-            solution = self.settle(2, 10)
+            self.state = replace(self.state, doubt=new)
+            solution = self.settle(2)
         return solution
+
+    def _shifted(self, solution: Solution) -> tuple[Solution, FloatArray]:
+        """Without a run of visits that is shifted, if there is one that matters; D of its points."""
+        run, before = shifted_run(solution), (self.state, self.rounds, self.converged)
+        doubt = np.zeros(self.data.seen.shape)
+        if run is None:
+            return solution, doubt
+        doubt[run] = OUT * len(run) * float(np.sum(left_out(solution).residuals**2, axis=2).max())
+        self.state = replace(self.state, doubt=doubt)
+        without = self.settle(MOST_ROUNDS)
+        left, seen = left_out(without), self.data.seen[run]
+        shift = left.residuals[run][seen].mean(axis=0)
+        rest = without.problem.covariance[np.setdiff1d(np.arange(len(doubt)), run)]
+        std = np.sqrt(np.median(np.trace(rest, axis1=1, axis2=2)) / doubt.shape[1])
+        if np.linalg.norm(shift) > MATERIAL * std:
+            return without, np.where(self.data.seen, doubt, 0.0)
+        self.state, self.rounds, self.converged = before
+        return solution, np.zeros_like(doubt)
 
     def choose_terms(self, solution: Solution) -> tuple[Solution, dict[str, float]]:
         """Without the terms that do not better the left-out score; term → gain."""
@@ -236,22 +248,21 @@ def estimate(
         solution = work.settle(2)
     scales = scale_covariance(solution)
     if some is not None:
-        inflation = Inflation.none(data.seen)
-        inflation.points[some], inflation.visits[some] = work.state.inflation.points, work.state.inflation.visits
+        doubt = np.zeros(data.seen.shape)
+        doubt[some] = work.state.doubt
         whole = _Work(robot, data, work.state.model, load)
-        whole.state, whole.rounds = replace(work.state, inflation=inflation), work.rounds
+        whole.state, whole.rounds = replace(work.state, doubt=doubt), work.rounds
         solution = whole.settle(2, 0)
-        if robust:
-            for _ in range(2):
-                whole.state = replace(whole.state, inflation=impossible(solution, whole.plain()))
-                solution = whole.settle(1, 0)
+        for _ in range(2 if robust else 0):
+            whole.state = replace(whole.state, doubt=impossible(solution, whole.state.doubt))
+            solution = whole.settle(1, 0)
         work = whole
     hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
     known = Knowledge(robot, work.state.model, work.state.coefficients, covariance, hidden)
     return ModelEstimate(
         knowledge=known,
         left_out=left_out(solution),
-        inflation=work.state.inflation,
+        doubt=work.state.doubt,
         terms=_worths(model, work.state, solution, gains),
         solution=solution,
         rounds=work.rounds,

@@ -99,18 +99,3 @@ def left_out(solution: Solution) -> LeftOut:
         scores,
         seen,
     )
-
-
-def left_out_together(solution: Solution, visits: NDArray[np.int64]) -> tuple[float, int]:
-    """Σ eᵀ P_gg e of several ``visits`` g left out at once, and its degrees of freedom."""
-    problem = solution.problem
-    m = problem.y.shape[1]
-    rows = (visits[:, None] * m + np.arange(m)).ravel()
-    rows = rows[problem.seen.ravel()[rows] > 0]
-    weighted = solution.weighted.ravel()[rows]
-    blocks = solution.blocks_of(rows)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(blocks), 1e-300))
-    shares, vectors = np.linalg.eigh(blocks * np.outer(scale, scale))
-    known = shares > ALONE
-    turned = vectors.T @ (scale * weighted)
-    return float(np.sum(turned[known] ** 2 / shares[known])), int(known.sum())

@@ -166,10 +166,6 @@ class Solution:
         """P · vectors, (N·m, n) → (N·m, n)."""
         raise NotImplementedError
 
-    def blocks_of(self, rows: IntArray) -> FloatArray:
-        """P of some of the N·m coordinates: (len(rows), len(rows))."""
-        raise NotImplementedError
-
     def _reduced(self, vectors: FloatArray) -> FloatArray:
         """γ̂ and Λ^-½ û if ``vectors`` (N·m, n) had been measured: (rank + K, n)."""
         raise NotImplementedError
@@ -199,9 +195,6 @@ class DenseSolution(Solution):
     def project(self, vectors: FloatArray) -> FloatArray:
         return self.projection @ vectors
 
-    def blocks_of(self, rows: IntArray) -> FloatArray:
-        return self.projection[np.ix_(rows, rows)]
-
     def _reduced(self, vectors: FloatArray) -> FloatArray:
         flat = self.spread @ (self.carried.T @ vectors)
         return np.vstack([flat, self.problem.scaled_columns.T @ (self.projection @ vectors)])
@@ -226,16 +219,6 @@ class CoefficientSolution(Solution):
         turned = (self.inverse @ vectors.reshape(n, m, -1)).reshape(n * m, -1)
         turned = turned - self.white @ (self.half @ (self.half.T @ (self.white.T @ turned)))
         return (self.inverse.transpose(0, 2, 1) @ turned.reshape(n, m, -1)).reshape(n * m, -1)
-
-    def blocks_of(self, rows: IntArray) -> FloatArray:
-        m = self.problem.y.shape[1]
-        visits = np.unique(rows // m)
-        own = (visits[:, None] * m + np.arange(m)).ravel()
-        lower = block_diagonal(self.inverse[visits])
-        share = self.white[own] @ self.half
-        block = lower.T @ (lower - share @ (share.T @ lower))
-        at = np.searchsorted(own, rows)
-        return np.asarray(block[np.ix_(at, at)])
 
     def _reduced(self, vectors: FloatArray) -> FloatArray:
         n, m = self.problem.y.shape
@@ -315,14 +298,6 @@ def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
         white,
         half,
     )
-
-
-def block_diagonal(blocks: FloatArray) -> FloatArray:
-    """(N, m, m) → (N·m, N·m)."""
-    n, m, _ = blocks.shape
-    result = np.zeros((n, m, n, m))
-    result[np.arange(n), :, np.arange(n), :] = blocks
-    return result.reshape(n * m, n * m)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
