@@ -379,8 +379,14 @@ def scale_covariance(solution: Solution) -> tuple[tuple[str, ...], FloatArray]:
     return names, 2.0 * np.linalg.inv(information)
 
 
-def maximise(problem: LinearProblem, rounds: int = 30) -> Solution:
-    """The scales of greatest restricted likelihood times their priors; the solution there."""
+def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED) -> Solution:
+    """The scales of greatest restricted likelihood times their priors; the solution there.
+
+    Args:
+        problem: At the scales to begin from.
+        rounds: Most Newton steps.
+        settled: See ``SETTLED``.
+    """
     names = unknown_scales(problem.model, problem.parts, problem.robot)
     best = solve(problem)
     if not names:
@@ -391,7 +397,7 @@ def maximise(problem: LinearProblem, rounds: int = 30) -> Solution:
         gradient, information = gradient + slope, information + np.diag(curve)
         step = -np.linalg.solve(information, gradient)
         step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-        if -(gradient @ step) < SETTLED:
+        if -(gradient @ step) < settled:
             break
         for _ in range(6):
             values = {n: best.problem.model.values[n] * np.exp(s) for n, s in zip(names, step, strict=True)}
