@@ -246,6 +246,8 @@ def estimate(
     if choose:
         solution, gains = work.choose_terms(solution)
         solution = work.settle(2)
+    if work.state.model.scales:
+        solution = work.settle(MOST_ROUNDS, 0)
     scales = scale_covariance(solution)
     if some is not None:
         doubt = np.zeros(data.seen.shape)

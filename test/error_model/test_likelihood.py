@@ -117,7 +117,7 @@ def test_the_value_is_the_restricted_likelihood(problem: LinearProblem) -> None:
 
 
 def test_the_maximum_is_one(problem: LinearProblem) -> None:
-    best = maximise(problem, 60, 1e-7)
+    best = maximise(problem, 200, 1e-9)
     names = unknown_scales(best.problem.model, problem.parts, problem.robot)
     gradient, _ = derivatives(best, names)
     assert np.abs(gradient + penalty(best.problem.model, names)[1]).max() < 1e-2
