@@ -32,6 +32,8 @@ FREEDOM = 2.0
 """ν of the Student t while it is not known who is wrong."""
 IMPOSSIBLE = 0.01
 """Probability that one among all points, or all runs, of a sound calibration is called impossible."""
+FEW = 0.02
+"""Share of impossible points up to which they are found one by one."""
 SWOLLEN = 0.6
 """Median of d² over that of χ² below which gross errors have swollen the scales."""
 OUT = 10.0
@@ -40,11 +42,11 @@ FEWEST = 3
 """Visits of the shortest run."""
 
 
-def suspicious(solution: Solution, doubt: FloatArray) -> bool:
-    """Whether some point is impossible, or gross errors seem to have swollen the scales."""
+def many_are_wrong(solution: Solution, doubt: FloatArray) -> bool:
+    """Whether more than a few points are impossible, or gross errors seem to have swollen the scales."""
     squares, seen, _ = _squares(solution, doubt)
-    gate = float(chdtri(3, IMPOSSIBLE / max(int(seen.sum()), 1)))
-    return bool((squares[seen] > gate).any() or np.median(squares[seen]) < SWOLLEN * float(chdtri(3, 0.5)))
+    far = squares[seen] > float(chdtri(3, IMPOSSIBLE / max(int(seen.sum()), 1)))
+    return bool(far.mean() > FEW or np.median(squares[seen]) < SWOLLEN * float(chdtri(3, 0.5)))
 
 
 def student(solution: Solution, doubt: FloatArray) -> FloatArray:

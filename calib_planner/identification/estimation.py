@@ -23,7 +23,7 @@ from calib_planner._arrays import FloatArray
 from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
-from calib_planner.identification.doubt import OUT, impossible, part_of, shifted_run, student, suspicious
+from calib_planner.identification.doubt import OUT, impossible, many_are_wrong, part_of, shifted_run, student
 from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import (
     LinearProblem,
@@ -158,7 +158,7 @@ class _Work:
     def doubt(self, solution: Solution) -> Solution:
         """Take the weight of what is impossible, and fit again."""
         solution, run = self._shifted(solution)
-        if suspicious(solution, self.state.doubt):
+        if many_are_wrong(solution, self.state.doubt):
             for _ in range(STUDENT_ROUNDS):
                 old = self.state.doubt
                 new = np.maximum(student(solution, old), run)

@@ -35,6 +35,7 @@ class LeftOut:
         freedom: (N,) measured coordinates that other visits predict.
         scores: (N,) log score.
         seen: (N, targets) points that were measured.
+        doubted: (N, targets) points that lost their weight; their covariance says so.
     """
 
     residuals: FloatArray
@@ -43,6 +44,7 @@ class LeftOut:
     freedom: FloatArray
     scores: FloatArray
     seen: NDArray[np.bool_]
+    doubted: NDArray[np.bool_]
 
     @property
     def score(self) -> float:
@@ -51,9 +53,9 @@ class LeftOut:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(N, targets) measured points of visits that the others predict in every direction."""
+        """(N, targets) points that were measured, are not doubted, and that the other visits predict."""
         whole = self.freedom == 3 * self.seen.sum(axis=1)
-        return self.seen & whole[:, None]
+        return self.seen & whole[:, None] & ~self.doubted
 
     @property
     def distances(self) -> FloatArray:
@@ -90,7 +92,9 @@ def left_out(solution: Solution) -> LeftOut:
     dark = m - known.sum(axis=1)
     determinant = np.sum(np.log(shares), axis=1) - 2.0 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
     scores = 0.5 * (determinant - squares - coordinates * np.log(2.0 * np.pi))
-    seen = problem.seen.reshape(n, -1, 3)[:, :, 0] > 0
+    seen, every = problem.seen.reshape(n, -1, 3)[:, :, 0] > 0, np.arange(m // 3)
+    doubts = problem.parts.get("doubt", np.zeros_like(problem.covariance))
+    doubted = np.trace(doubts.reshape(n, m // 3, 3, m // 3, 3)[:, every, :, every, :], axis1=2, axis2=3).T > 0
     return LeftOut(
         residuals.reshape(n, -1, 3) * seen[:, :, None],
         half @ half.transpose(0, 2, 1),
@@ -98,4 +102,5 @@ def left_out(solution: Solution) -> LeftOut:
         coordinates - dark,
         scores,
         seen,
+        doubted,
     )
