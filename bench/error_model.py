@@ -5,9 +5,10 @@
 Measured robots, with ``full`` placement and base and tool unknown: ``irb120_tracker`` (36 × 3 points fitted; the
 40 rows of both test files predicted, the place of the re-seated target taken from the first row of each file),
 ``ur10_tracker`` (100 and 30 random rows of ``random_poses`` fitted, all others predicted; of ``joint_sweeps`` 100
-random rows, all others predicted). No test row is used for anything else. Simulated robots, one kind of error each:
-40 × 2 points are fitted, 300 fresh configurations predicted. Shown are means over the seeds of: mean and rms
-distance [mm], predicted over achieved rms, left-out rms [mm], share of coordinates within 95 % intervals, seconds.
+random rows, all others predicted). No test row is used for anything else. Simulated robots, one kind of error
+each: 40 × 2 points are fitted, 300 fresh configurations predicted. Shown are means over the seeds of: mean and
+rms distance [mm], predicted over achieved rms, left-out rms [mm], share of coordinates within 95 % intervals,
+seconds.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot
-
 from calib_planner.error_model import ErrorModel, typical
 from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.files.measurements_csv import read_measurements

@@ -4,15 +4,15 @@ A mass at p_m that hangs on the links behind joint l turns that joint, with axis
 
     τ_lm(q) = (w_l × (p_m − o_l)) · d ,
 
-d being the unit vector downwards; a sliding joint feels τ_lm = w_l · d. Moments are those of a unit weight: metres of
-horizontal lever arm. A joint of compliance κ gives way by δ_l = κ τ, so that a point moves by
+d being the unit vector downwards; a sliding joint feels τ_lm = w_l · d. Moments are those of a unit weight:
+metres of horizontal lever arm. A joint of compliance κ gives way by δ_l = κ τ, so that a point moves by
 
     Σ_lm c_l(q) τ_lm(q) u_lm ,        c_l = ∂p/∂q_l ,   u_lm ~ N(0, σ_g²)  [rad/m].
 
-The coefficient u_lm holds compliance times weight. Where nothing is known of the links, unit masses stand at elbow,
-wrist and tip. Where masses and centres of gravity are known, they are one mass (of weight one altogether), and a
-payload is another: one coefficient per joint and mass. The coefficients predict; lumped masses, friction and play
-that depends on the moment are in them, so they are not compliances.
+The coefficient u_lm holds compliance times weight. Where nothing is known of the links, unit masses stand at
+elbow, wrist and tip. Where masses and centres of gravity are known, they are one mass (of weight one altogether),
+and a payload is another: one coefficient per joint and mass. The coefficients predict; lumped masses, friction
+and play that depends on the moment are in them, so they are not compliances.
 """
 
 from __future__ import annotations

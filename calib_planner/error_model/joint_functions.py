@@ -1,7 +1,8 @@
 """Errors of each joint's own transmission and encoder: a function of that joint's angle alone.
 
 Gears, couplings and encoders turn joint l by φ_l(q_l) more than it says, the same each time. A point moves by
-c_l(q) φ_l(q_l). Nothing is known of φ but how large and how smooth it is: it is a Gaussian process with the kernel
+c_l(q) φ_l(q_l). Nothing is known of φ but how large and how smooth it is: it is a Gaussian process with the
+kernel
 
     k(Δ) = σ² (exp((cos Δ − 1)/ℓ²) − I) / (1 − I) ,        I = e^{−κ} I_0(κ) ,   κ = 1/ℓ² ,
 
@@ -11,8 +12,8 @@ exp(κ cos Δ) = I_0(κ) + 2 Σ_n I_n(κ) cos nΔ it is exactly the Fourier seri
 
     φ_l(q) = Σ_n a_n cos n x + b_n sin n x ,   var a_n = var b_n = σ² λ_n ,   λ_n = 2 e^{−κ} I_n(κ)/(1 − I),
 
-with x = q where the joint turns and half a turn over its range where it slides. The sum ends at ``harmonics`` and λ
-is scaled to the sum one. With I_n' = (I_{n−1} + I_{n+1})/2 its derivative by log ℓ is closed, too. Several
+with x = q where the joint turns and half a turn over its range where it slides. The sum ends at ``harmonics`` and
+λ is scaled to the sum one. With I_n' = (I_{n−1} + I_{n+1})/2 its derivative by log ℓ is closed, too. Several
 components, a short and a long ℓ, add their variances to the same coefficients.
 """
 
@@ -38,8 +39,8 @@ class JointFunctions:
     """The errors of the joints' transmissions.
 
     Attributes:
-        components: Names among ``COMPONENTS``, each once; their σ [rad] and ℓ [rad] are scales of the error model.
-        harmonics: Where the Fourier series end; 0: as the components need it.
+        components: Names among ``COMPONENTS``, each once; their σ [rad] and ℓ [rad] are scales of the error
+            model. harmonics: Where the Fourier series end; 0: as the components need it.
     """
 
     components: tuple[str, ...] = ("smooth", "short")

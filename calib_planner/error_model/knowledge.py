@@ -5,8 +5,8 @@ precision M₀ and the covariance R_i of a visit,
 
     M = M₀ + Σ_i J⁺_iᵀ R_i⁻¹ J⁺_i ,     C = M⁻¹ .                                                            (M2)
 
-What remains uncertain at test poses, stacked in J⁺_0 (rows x, y, z of every pose and target), is one of two things.
-*world* is the error of the position in the frame of the points,
+What remains uncertain at test poses, stacked in J⁺_0 (rows x, y, z of every pose and target), is one of two
+things. *world* is the error of the position in the frame of the points,
 
     ρ0² = trace(J⁺_0 C J⁺_0ᵀ) / (poses · targets) ,                                                          (M3)
 

@@ -2,12 +2,12 @@
 
 For configuration i and target t, with J⁺ = [∂g/∂Π, B] and β = (ΔΠ, u),
 
-    y_it = g(q_i; Π, base, target_t) + Σ_k B_k(q_i, t) u_k + c(q_i) h_i + s_i + ε_it ,                          (M1)
+    y_it = g(q_i; Π, base, target_t) + Σ_k B_k(q_i, t) u_k + c(q_i) h_i + s_i + ε_it ,                        (M1)
 
 the terms placement (J), gravity and joint functions (B) bring columns with a normal prior each, M₀ being its
-precision (zero where it is flat); the terms visits and points (h, s, ε) bring the covariance R_i of a visit, whose
-rows are x, y, z target by target. How large each is, is a *scale* with a value and a log-normal prior. Nothing else
-knows these sizes: plan, identification, prediction and simulation ask the same ``ErrorModel``.
+precision (zero where it is flat); the terms visits and points (h, s, ε) bring the covariance R_i of a visit,
+whose rows are x, y, z target by target. How large each is, is a *scale* with a value and a log-normal prior.
+Nothing else knows these sizes: plan, identification, prediction and simulation ask the same ``ErrorModel``.
 
 The paper is the special case of no gravity, no joint functions, no visits, flat placement and R = σ² I.
 """
@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_planner._arrays import FloatArray, check_number
 from calib_planner.error_model.gravity import Gravity
@@ -122,13 +121,17 @@ class ErrorModel:
         return replace(self, scales=scales, name=self.name if name is None else name)
 
     def without(self, term: str) -> ErrorModel:
-        """The same without ``gravity``, ``joint_functions``, ``visits``, or one component of the joint functions."""
+        """The same without ``gravity``, ``joint_functions``, ``visits`` or one component of the second."""
         if self.joint_functions is not None and term in self.joint_functions.components:
             left = tuple(c for c in self.joint_functions.components if c != term)
             return replace(self, joint_functions=JointFunctions(left) if left else None)
-        if term not in ("gravity", "joint_functions", "visits"):
-            raise UnknownNameError("term", term, ("gravity", "joint_functions", "smooth", "short", "visits"))
-        return replace(self, **{term: None})
+        if term == "gravity":
+            return replace(self, gravity=None)
+        if term == "joint_functions":
+            return replace(self, joint_functions=None)
+        if term == "visits":
+            return replace(self, visits=None)
+        raise UnknownNameError("term", term, ("gravity", "joint_functions", "smooth", "short", "visits"))
 
     # ── what it is ───────────────────────────────────────────────────────────────────────────────────
 
@@ -212,7 +215,3 @@ class ErrorModel:
         """
         visits = {} if self.visits is None else self.visits.parts(poses, self.values)
         return visits | self.points.parts(poses, self.values, stated)
-
-    def seen(self, mask: NDArray[np.bool_]) -> FloatArray:
-        """(N, 3·targets) 1 for the coordinates of targets that were measured, 0 for the others."""
-        return np.repeat(mask, 3, axis=1).astype(float)

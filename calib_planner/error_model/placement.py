@@ -1,29 +1,31 @@
 """Where the parts of the robot, its base and its targets are: the parameters of the chain, eq. (1)–(3).
 
-The columns are those of the identification Jacobian, ∂g/∂Π. What is known of a parameter before the data is a normal
-distribution around its nominal value, or nothing (a *flat* prior, precision zero, as in the paper). Base and targets
-are where somebody has put them: they are always flat. A part of the chain is made to a tolerance: a length is within
-``placement.length`` and an angle within ``placement.angle`` of the data sheet, two standard deviations of the error
-model. The zero of a joint is set by hand and hardly known (``ZERO``). A prior that the user states for some
-parameters replaces the tolerance of these.
+The columns are those of the identification Jacobian, ∂g/∂Π. What is known of a parameter before the data is a
+normal distribution around its nominal value, or nothing (a *flat* prior, precision zero, as in the paper). Base
+and targets are where somebody has put them: they are always flat. A part of the chain is made to a tolerance: a
+length is within ``placement.length`` and an angle within ``placement.angle`` of the data sheet, two standard
+deviations of the error model. The zero of a joint is set by hand and hardly known (``ZERO``). A prior that the
+user states for some parameters replaces the tolerance of these.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray, check_array
+from calib_planner._arrays import FloatArray
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot.chain import Robot
 
 ZERO = 0.02
 """Standard deviation of the zero of a joint, in any unit [rad | m]."""
+BoolArray = NDArray[np.bool_]
 PRIORS = ("tolerance", "flat")
 
 
@@ -84,29 +86,24 @@ class Placement:
 
     def slopes(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (P,) derivative of ``variances`` by its logarithm."""
-        result = {}
+        result: dict[str, FloatArray] = {}
         for name, rows in self._rows(robot).items():
             slope = np.zeros(len(robot.parameter_names))
             slope[rows] = 2.0 * values[name] ** 2
             result[name] = slope
         return result
 
-    def _rows(self, robot: Robot) -> dict[str, FloatArray]:
+    def _rows(self, robot: Robot) -> dict[str, BoolArray]:
         """Scale → (P,) whether a parameter's prior is that scale."""
-        free = is_placement(robot) & ~joint_zeros(robot)
+        free = is_placement(robot.parameter_names) & ~joint_zeros(robot)
         free &= np.array([n not in dict(self.stated) for n in robot.parameter_names], bool)
         angle = np.array([p.unit == "rad" for p in robot.parameters], bool)
         rows = {"placement.length": free & ~angle, "placement.angle": free & angle}
         return {n: r for n, r in rows.items() if n in self.scales and r.any()}
 
 
-def is_placement(robot: Robot) -> FloatArray:
-    """(P,) whether a parameter belongs to the chain; the others place the base or a target."""
-    return np.array([not n.startswith(("base.", "target_")) for n in robot.parameter_names], bool)
-
-
 @lru_cache(maxsize=64)
-def joint_zeros(robot: Robot) -> FloatArray:
+def joint_zeros(robot: Robot) -> BoolArray:
     """(P,) whether a parameter acts as a joint does, wherever the robot stands.
 
     Of two that act alike (a joint's offset and a rotation about the same axis) both are zeros.
@@ -120,15 +117,9 @@ def joint_zeros(robot: Robot) -> FloatArray:
     least = 1e-9 * np.abs(joints).max()
     like = [np.abs(columns[..., :, None] - s * joints[..., None, :]).max(axis=(0, 1)) < least for s in (1, -1)]
     acts = dict(zip(robot.parameter_names, (like[0] | like[1]).any(axis=1), strict=True))
-    return np.array([acts.get(n, False) for n in names], bool) & is_placement_names(names)
+    return np.array([acts.get(n, False) for n in names], bool) & is_placement(names)
 
 
-def is_placement_names(names: tuple[str, ...]) -> FloatArray:
-    """(P,) the same for names alone."""
+def is_placement(names: Sequence[str]) -> BoolArray:
+    """(P,) whether a parameter belongs to the chain; the others place the base or a target."""
     return np.array([not n.startswith(("base.", "target_")) for n in names], bool)
-
-
-def stated_prior(names: tuple[str, ...], std: ArrayLike) -> Placement:
-    """Placement with stated standard deviations (K,) [m | rad] for ``names``, tolerance for the others."""
-    values = check_array("prior.std", std, (len(names),))
-    return Placement(stated=tuple(zip(names, map(float, values), strict=True)))

@@ -1,10 +1,10 @@
 """What is new at each point: the instrument's noise and a floor.
 
 The instrument says how it errs in each direction, a covariance Σ_it that depends on where the point is
-(``Noise``, or the standard deviations that came with the data). It may be wrong by a factor, which the data can tell:
-its square root is the scale ``instrument``, one where the instrument is believed. Below it lies a floor of the same
-size in all directions, ``floor``: a reflector that does not sit the same each time, air, what no other term holds.
-Where no instrument is stated the floor is all there is.
+(``Noise``, or the standard deviations that came with the data). It may be wrong by a factor, which the data can
+tell: its square root is the scale ``instrument``, one where the instrument is believed. Below it lies a floor of
+the same size in all directions, ``floor``: a reflector that does not sit the same each time, air, what no other
+term holds. Where no instrument is stated the floor is all there is.
 
     cov ε_it = scale² Σ_it + floor² I
 """
@@ -49,7 +49,8 @@ class Points:
     ) -> dict[str, FloatArray]:
         """Scale → (N, 3·targets, 3·targets) its part of the covariance of a visit [m²].
 
-        The part ``instrument`` is there whenever somebody states the noise; it is a scale only if it is estimated.
+        The part ``instrument`` is there whenever somebody states the noise; it is a scale only if it is
+        estimated.
 
         Args:
             poses: Where the points are.
@@ -59,7 +60,7 @@ class Points:
         targets = len(poses.robot.targets)
         if stated is None and self.noise is not None:
             stated = self.noise.covariance(poses.points)
-        result = {}
+        result: dict[str, FloatArray] = {}
         if stated is not None:
             blocks = np.zeros((len(poses), targets, 3, targets, 3))
             every = np.arange(targets)

@@ -1,8 +1,8 @@
 """Configurations with everything that the terms of the error model need of them, computed once.
 
 A joint that reads q_l stands at q_l + δ_l, where the deflection δ comes from the elastic term and the joint
-functions. Positions and derivatives are taken at the deflected joints; what a term depends on (a joint's own angle,
-a moment of gravity) is taken at the readings.
+functions. Positions and derivatives are taken at the deflected joints; what a term depends on (a joint's own
+angle, a moment of gravity) is taken at the readings.
 """
 
 from __future__ import annotations

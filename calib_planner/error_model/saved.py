@@ -1,7 +1,7 @@
 """The error model as plain data, for YAML: alone or as a part of an estimate.
 
-``to_mapping`` gives dictionaries, lists, numbers and strings; ``from_mapping`` reads them back to an equal model and
-refuses what it does not know, naming the key.
+``to_mapping`` gives dictionaries, lists, numbers and strings; ``from_mapping`` reads them back to an equal model
+and refuses what it does not know, naming the key.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _noise(field: str, data: Mapping[str, Any]) -> Noise:
 def _noise_mapping(noise: Noise) -> dict[str, Any]:
     for kind, made in NOISES.items():
         if isinstance(noise, made):
-            return {"kind": kind, **{f.name: _plain(getattr(noise, f.name)) for f in fields(noise)}}
+            return {"kind": kind, **{f.name: _plain(getattr(noise, f.name)) for f in fields(made)}}
     raise InputError("points.noise", type(noise).__name__, f"one of {', '.join(NOISES)} to be saved")
 
 

@@ -1,14 +1,14 @@
 """What is new at each visit and the same for all targets seen there.
 
-A joint does not come back to exactly where it was: at visit i the joints err by h_i ~ N(0, σ_j² I), and the targets
-move by c(q_i) h_i. What else the targets of one visit share (the tracker's frame as it is that moment, warmth of the
-arm, a base that gives way) is a common shift s_i ~ N(0, σ_c² I). Together they are, with c the levers of the visit
-and 1 the column that repeats the three axes for every target,
+A joint does not come back to exactly where it was: at visit i the joints err by h_i ~ N(0, σ_j² I), and the
+targets move by c(q_i) h_i. What else the targets of one visit share (the tracker's frame as it is that moment,
+warmth of the arm, a base that gives way) is a common shift s_i ~ N(0, σ_c² I). Together they are, with c the
+levers of the visit and 1 the column that repeats the three axes for every target,
 
     cov = σ_j² c cᵀ + σ_c² (1 1ᵀ ⊗ I_3) .
 
-Visits are independent of each other. With a single target s_i cannot be told from the floor of the point, which then
-stands for both.
+Visits are independent of each other. With a single target s_i cannot be told from the floor of the point, which
+then stands for both.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Visits:
 
     def parts(self, poses: Poses, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (N, 3·targets, 3·targets) its part of the covariance of a visit [m²]."""
-        result, count = {}, len(poses.robot.targets)
+        result: dict[str, FloatArray] = {}
+        count = len(poses.robot.targets)
         if self.joints:
             columns = poses.levers * values["repeatability"]
             result["repeatability"] = columns @ columns.transpose(0, 2, 1)

@@ -5,10 +5,10 @@ variance D of its own beside R_i (so that it tells the scales nothing either), a
 
     d² = eᵀ (P_ii⁻¹ − D)⁻¹ e     (χ² of its coordinates, if the model is right).
 
-*Student*: while it is not known who is wrong, every point counts as under a Student t with few degrees of freedom ν,
-D = R (d² − 3)/(ν + 3), and the scales are estimated beside it; gross errors then neither bend the fit nor swell the
-scales. *Impossible*: in the end only points less probable than ``IMPOSSIBLE`` among that many stay doubtful, with D
-so large that they count no more, and the rest counts in full.
+*Student*: while it is not known who is wrong, every point counts as under a Student t with few degrees of freedom
+ν, D = R (d² − 3)/(ν + 3), and the scales are estimated beside it; gross errors then neither bend the fit nor
+swell the scales. *Impossible*: in the end only points less probable than ``IMPOSSIBLE`` among that many stay
+doubtful, with D so large that they count no more, and the rest counts in full.
 
 A run of visits that are all shifted alike excuse each other. A common shift of the visits a … b is the columns G,
 an identity for each of their points; with the linear problem's P its score statistic
@@ -76,9 +76,9 @@ def shifted_run(solution: Solution) -> IntArray | None:
         return None
     shift = np.tile(np.eye(3), (m // 3, 1))
     columns = (seen[:, :, None] * shift).reshape(n * m, 3)
-    blocks = np.zeros((n * m, n, 3))
-    blocks[np.arange(n * m), np.repeat(np.arange(n), m)] = columns
-    blocks = blocks.reshape(n * m, 3 * n)
+    spread = np.zeros((n * m, n, 3))
+    spread[np.arange(n * m), np.repeat(np.arange(n), m)] = columns
+    blocks = spread.reshape(n * m, 3 * n)
     middle = (blocks.T @ solution.project(blocks)).reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
     pull = (blocks.T @ solution.weighted.ravel()).reshape(n, 3)
     area = np.zeros((n + 1, n + 1, 3, 3))
@@ -103,7 +103,7 @@ def shifted_run(solution: Solution) -> IntArray | None:
 
 
 def _squares(solution: Solution, doubt: FloatArray) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
-    """(N, targets) d², which points were measured, and the mean variance of a coordinate in R_i without D [m²]."""
+    """(N, targets) d²; which points were measured; mean variance of a coordinate in R_i without D [m²]."""
     left = left_out(solution)
     n, targets, _ = left.residuals.shape
     every = np.arange(targets)

@@ -7,7 +7,8 @@
     3. doubt      Where points or a run of visits are impossible beside the others, these lose their weight
                   (``doubt``).
     4. terms      A term that does not better the left-out score goes (``left_out``).
-    5. all        Many points: 1 to 4 are done with some of the visits, and generalised least squares at the scales
+    5. all        Many points: 1 to 4 are done with some of the visits, and generalised least squares at the
+    scales
                   found with all of them.
 
 The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
@@ -182,7 +183,7 @@ class _Work:
         doubt = np.zeros(self.data.seen.shape)
         if run is None:
             return solution, doubt
-        doubt[run] = OUT * len(run) * float(np.sum(left_out(solution).residuals**2, axis=2).max())
+        doubt[run] = OUT * len(run) * float(np.sum(left_out(solution).residuals ** 2, axis=2).max())
         self.state = replace(self.state, doubt=doubt)
         without = self.settle(MOST_ROUNDS)
         left, seen = left_out(without), self.data.seen[run]

@@ -5,9 +5,10 @@ the same scales, and its covariance are
 
     e_i = P_ii⁻¹ (P y)_i ,     cov e_i = P_ii⁻¹ .                                                           (M4)
 
-So cross-validation by visits costs nothing. The log score of a visit is the log of the density that the others gave
-its measurement, ½ log|P_ii| − ½ e_iᵀ P_ii e_i − ½ m log 2π; of two models the one with the larger sum predicts better.
-A visit that alone tells a parameter has no left-out residual: R_i^½ P_ii R_i^½ is singular there.
+So cross-validation by visits costs nothing. The log score of a visit is the log of the density that the others
+gave its measurement, ½ log|P_ii| − ½ e_iᵀ P_ii e_i − ½ m log 2π; of two models the one with the larger sum
+predicts better. A visit that alone tells a parameter has no left-out residual: R_i^½ P_ii R_i^½ is singular
+there.
 """
 
 from __future__ import annotations

@@ -1,25 +1,25 @@
 """The linear problem of one relinearisation: generalised least squares and the restricted likelihood.
 
-With the flat columns F (base, targets, and placement where its prior is flat), all other columns B with coefficients
-u ~ N(0, Λ), and V = blockdiag(R_i) + B Λ Bᵀ, the measured minus the predicted coordinates are
+With the flat columns F (base, targets, and placement where its prior is flat), all other columns B with
+coefficients u ~ N(0, Λ), and V = blockdiag(R_i) + B Λ Bᵀ, the measured minus the predicted coordinates are
 
     y = F γ + B u + e ,      y ~ N(F γ, V),
 
     P = V⁻¹ − V⁻¹F S⁻¹ FᵀV⁻¹ ,   S = FᵀV⁻¹F ,   γ̂ = S⁻¹FᵀV⁻¹y ,   û = Λ Bᵀ P y ,                            (1)
-    −2 log L = log|V| + log|S| + yᵀ P y      (Patterson & Thompson 1971, without its constants).                (2)
+    −2 log L = log|V| + log|S| + yᵀ P y      (Patterson & Thompson 1971, without its constants).               (2)
 
-Its derivative by a scale θ is tr(P ∂V) − (Py)ᵀ ∂V (Py). R has blocks and Λ is diagonal, so that three things tell all
-derivatives: the blocks P_ii, the vector Py, and for every column b_k both b_kᵀ P b_k and b_kᵀ P y.
+Its derivative by a scale θ is tr(P ∂V) − (Py)ᵀ ∂V (Py). R has blocks and Λ is diagonal, so that three things tell
+all derivatives: the blocks P_ii, the vector Py, and for every column b_k both b_kᵀ P b_k and b_kᵀ P y.
 
 Two forms give them. The *dense* one factorises V, of the size of the measured coordinates. The one *by
 coefficients* factorises, with W = [F, B Λ^½] and D = diag(0, 1) (Woodbury),
 
-    A = Wᵀ R⁻¹ W + D ,   P = R⁻¹ − R⁻¹ W A⁻¹ Wᵀ R⁻¹ ,   log|V| + log|S| = log|R| + log|A|,                       (3)
+    A = Wᵀ R⁻¹ W + D ,   P = R⁻¹ − R⁻¹ W A⁻¹ Wᵀ R⁻¹ ,   log|V| + log|S| = log|R| + log|A|,                     (3)
 
-of the size of the coefficients: for thousands of points. Columns scaled by Λ^½ keep A regular when a term vanishes,
-and R is regular because its scales have priors. Flat columns enter as an orthonormal basis of what they span, so
-that redundant ones do no harm: β_flat = Z γ with the shortest solution. Coordinates that were not measured are rows
-of zeros with variance one; they change nothing.
+of the size of the coefficients: for thousands of points. Columns scaled by Λ^½ keep A regular when a term
+vanishes, and R is regular because its scales have priors. Flat columns enter as an orthonormal basis of what they
+span, so that redundant ones do no harm: β_flat = Z γ with the shortest solution. Coordinates that were not
+measured are rows of zeros with variance one; they change nothing.
 
 The scales are the maximum of L times their log-normal priors (``maximise``), by Newton steps with the average
 information f_aᵀ P f_b, f_a = ∂_a V P y (Gilmour, Thompson & Cullis 1995), in the logarithms of the scales.
@@ -179,7 +179,7 @@ class Solution:
         return self.problem.expand(self._reduced(vectors))
 
     def posterior(self) -> FloatArray:
-        """(coefficients, coefficients) covariance C of β given the data, (M2); zero in directions no point shows."""
+        """(coefficients, coefficients) C of β given the data, (M2); zero in directions no point shows."""
         half = self.problem.expand(self._reduced_covariance())
         return self.problem.expand(half.T)
 
@@ -208,21 +208,26 @@ class DenseSolution(Solution):
 
 @dataclass(frozen=True, eq=False)
 class CoefficientSolution(Solution):
-    """By (3): ``inverse`` (N, m, m) of R_i = L Lᵀ, ``white`` (N·m, rank + K) L⁻¹W, ``half`` with A⁻¹ = half halfᵀ."""
+    """By (3).
+
+    ``inverse`` (N, m, m) holds L⁻¹ of R_i = L Lᵀ, ``white`` (N·m, rank + K) is L⁻¹W, and half halfᵀ = A⁻¹.
+    """
 
     inverse: FloatArray
     white: FloatArray
     half: FloatArray
 
     def project(self, vectors: FloatArray) -> FloatArray:
-        n, m = self.problem.y.shape
-        turned = (self.inverse @ vectors.reshape(n, m, -1)).reshape(n * m, -1)
+        turned = self._times(self.inverse, vectors)
         turned = turned - self.white @ (self.half @ (self.half.T @ (self.white.T @ turned)))
-        return (self.inverse.transpose(0, 2, 1) @ turned.reshape(n, m, -1)).reshape(n * m, -1)
+        return self._times(self.inverse.transpose(0, 2, 1), turned)
+
+    def _times(self, blocks: FloatArray, vectors: FloatArray) -> FloatArray:
+        n, m = self.problem.y.shape
+        return np.asarray((blocks @ vectors.reshape(n, m, -1)).reshape(n * m, -1))
 
     def _reduced(self, vectors: FloatArray) -> FloatArray:
-        n, m = self.problem.y.shape
-        turned = (self.inverse @ vectors.reshape(n, m, -1)).reshape(n * m, -1)
+        turned = self._times(self.inverse, vectors)
         return np.asarray(self.half @ (self.half.T @ (self.white.T @ turned)))
 
     def _reduced_covariance(self) -> FloatArray:
@@ -376,7 +381,7 @@ def scale_covariance(solution: Solution) -> tuple[tuple[str, ...], FloatArray]:
     if not names:
         return names, np.zeros((0, 0))
     information = derivatives(solution, names)[1] + np.diag(penalty(problem.model, names)[2])
-    return names, 2.0 * np.linalg.inv(information)
+    return names, np.asarray(2.0 * np.linalg.inv(information))
 
 
 def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED) -> Solution:

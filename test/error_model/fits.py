@@ -41,7 +41,7 @@ def unknown(robot: Robot) -> Robot:
 def simulated(
     robot: Robot, scales: dict[str, float], count: int, seed: int, heavy: bool = False
 ) -> tuple[Measurements, Knowledge]:
-    """``count`` visits of a robot drawn from the error model, noise Student t (ν = 3) if ``heavy``, and the truth."""
+    """``count`` visits of a robot drawn from the model, noise Student t (ν = 3) if ``heavy``; the truth."""
     rng = np.random.default_rng(seed)
     model = typical().with_values(NOTHING | scales)
     variances = model.variances(robot)

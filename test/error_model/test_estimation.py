@@ -1,4 +1,4 @@
-"""The estimator: the paper's special case, simulated robots with known truth, gross errors, and a measured robot."""
+"""The estimator: the paper's case, simulated robots with known truth, gross errors, and a measured robot."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from calib_planner.error_model import (
 )
 from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
-from calib_planner.error_model.poses import SLIDE, joint_units
+from calib_planner.error_model.poses import joint_units
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.instrument.noise import Isotropic, LaserTracker
 
