@@ -154,6 +154,12 @@ def simulated(kind: Kind, seed: int, robot: Robot, visits: int = 40, fresh: int 
     return {"case": f"simulated: {kind.name}", "scales": found.knowledge.model.values, **row}
 
 
+def many(robot: Robot) -> dict[str, Any]:
+    """1 000 visits × 3 targets of a robot with every term, for the time it takes."""
+    three = robot.with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05], [-0.04, 0.02, 0.12]])
+    return simulated(Kind("1000 visits x 3", KINDS[5].scales), 0, three, visits=1000)
+
+
 def show(rows: list[dict[str, Any]]) -> None:
     """Means over the seeds of every case."""
     keys = ("mean_mm", "rms_mm", "predicted", "left_out_mm", "inside", "seconds")
@@ -180,6 +186,7 @@ def main() -> None:
     robot = Robot.load("ur10e").with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05]]).with_parameters("full")
     for kind in KINDS:
         rows += [simulated(kind, seed, robot) for seed in range(args.simulated)]
+    rows.append(many(robot))
     show(rows)
     if args.json:
         args.json.write_text(json.dumps({"error_model": rows}, indent=1) + "\n", encoding="utf-8")

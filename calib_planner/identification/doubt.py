@@ -38,6 +38,8 @@ SWOLLEN = 0.6
 """Median of d² over that of χ² below which gross errors have swollen the scales."""
 OUT = 10.0
 """Variance of what is impossible, as a multiple of its squared left-out residual."""
+LARGEST = 1e7
+"""Most by which a doubtful point's variance exceeds that of a good one: beyond it the point has no weight left."""
 FEWEST = 3
 """Visits of the shortest run."""
 
@@ -52,15 +54,15 @@ def many_are_wrong(solution: Solution, doubt: FloatArray) -> bool:
 def student(solution: Solution, doubt: FloatArray) -> FloatArray:
     """D (N, targets) of every point by the Student t [m²], from the D in force."""
     squares, seen, own = _squares(solution, doubt)
-    return np.where(seen, own * np.maximum(squares - 3.0, 0.0) / (FREEDOM + 3.0), 0.0)
+    return np.where(seen, own * np.clip((squares - 3.0) / (FREEDOM + 3.0), 0.0, LARGEST), 0.0)
 
 
 def impossible(solution: Solution, doubt: FloatArray) -> FloatArray:
     """D (N, targets) of impossible points [m²], 0 for all others."""
-    squares, seen, _ = _squares(solution, doubt)
+    squares, seen, own = _squares(solution, doubt)
     gate = float(chdtri(3, IMPOSSIBLE / max(int(seen.sum()), 1)))
     length = np.sum(left_out(solution).residuals ** 2, axis=2)
-    return np.where(seen & (squares > gate), OUT * length, 0.0)
+    return np.where(seen & (squares > gate), np.minimum(OUT * length, LARGEST * own), 0.0)
 
 
 def part_of(doubt: FloatArray) -> FloatArray:

@@ -24,7 +24,16 @@ from calib_planner._arrays import FloatArray
 from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
-from calib_planner.identification.doubt import OUT, impossible, many_are_wrong, part_of, shifted_run, student
+from calib_planner.errors import NotEnoughDataError
+from calib_planner.identification.doubt import (
+    LARGEST,
+    OUT,
+    impossible,
+    many_are_wrong,
+    part_of,
+    shifted_run,
+    student,
+)
 from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import (
     LinearProblem,
@@ -35,7 +44,7 @@ from calib_planner.identification.likelihood import (
     with_uncertain_scales,
 )
 from calib_planner.identification.measurements import Measurements
-from calib_planner.identification.registration import register
+from calib_planner.identification.registration import place, tip_poses
 from calib_planner.robot.chain import Robot
 
 MOST_STARTS = 20
@@ -44,10 +53,18 @@ MOST_ROUNDS = 6
 """Most relinearisations with new scales."""
 STUDENT_ROUNDS = 12
 """Most rounds of Student weights."""
+CAUCHY_ROUNDS = 30
+"""Most rounds of weights that place tracker and targets."""
+FAR = 30.0
+"""Points this many medians away are doubted from the start."""
+BENT = 1e-3
+"""Predictions that move by more than this are looked at before the step is taken [m]."""
 MOST_DOUBTS = 8
 """Most rounds in which impossible points come and go."""
 MATERIAL = 3.0
 """A run that is shifted by fewer standard deviations of a point is left alone."""
+LEAST = 1e-8
+"""Predictions that move by less than this stand still [m]."""
 STILL = 1e-3
 """Predictions that move by less than this share of a point's standard deviation stand still."""
 ENOUGH = 450
@@ -115,10 +132,8 @@ class _Work:
 
     def linearised(self) -> LinearProblem:
         """(M1) at the state."""
-        data, state, names = self.data, self.state, self.robot.parameter_names
-        here = self.robot.with_deviations(dict(zip(names, state.coefficients[: len(names)], strict=True)))
-        poses = Poses(here, data.q, self.load)
-        poses = replace(poses, deflection=state.model.deflection(poses, state.coefficients))
+        data, state = self.data, self.state
+        poses = self._poses(state.coefficients)
         seen = np.repeat(data.seen, 3, axis=1).astype(float)
         columns = state.model.columns(poses) * seen[:, :, None]
         apart = np.where(data.seen[:, :, None], data.p - poses.points, 0.0).reshape(seen.shape)
@@ -140,12 +155,32 @@ class _Work:
         problem, old = solution.problem, self.state.coefficients
         new = solution.coefficients.copy()
         new[problem.flat] += old[problem.flat]
-        change = problem.columns @ (new - old)
+        step = new - old
+        change = np.abs(problem.columns @ step)
+        shares = (1.0, 0.5, 0.25, 0.1, 0.03) if change.max() > BENT else (1.0,)
+        if len(shares) > 1:
+            cost = self._cost(problem, old)
+            step = next(
+                (share * step for share in shares if self._cost(problem, old + share * step) <= cost), 0.0 * step
+            )
         std = np.sqrt(np.diagonal(problem.covariance, axis1=1, axis2=2))
-        self.state = replace(self.state, coefficients=new, model=problem.model)
+        self.state = replace(self.state, coefficients=old + step, model=problem.model)
         self.rounds += 1
-        self.converged = bool((np.abs(change) <= STILL * std).all())
-        return self.converged
+        self.converged = bool((change <= STILL * std + LEAST).all())
+        return self.converged or not step.any()
+
+    def _cost(self, problem: LinearProblem, coefficients: FloatArray) -> float:
+        """What least squares minimises, through the kinematics and not its linearisation."""
+        apart = np.where(self.data.seen[:, :, None], self.data.p - self._poses(coefficients).points, 0.0)
+        flat = apart.reshape(len(apart), -1, 1)
+        prior = np.sum((coefficients[problem.random] / problem.root) ** 2, where=problem.root > 0.0)
+        return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
+
+    def _poses(self, coefficients: FloatArray) -> Poses:
+        names = self.robot.parameter_names
+        here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
+        poses = Poses(here, self.data.q, self.load)
+        return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
 
     def settle(self, most: int, scales: int = 30) -> Solution:
         """Relinearise until the predictions stand still; ``scales``: rounds for the scales each time."""
@@ -183,7 +218,9 @@ class _Work:
         doubt = np.zeros(self.data.seen.shape)
         if run is None:
             return solution, doubt
-        doubt[run] = OUT * len(run) * float(np.sum(left_out(solution).residuals ** 2, axis=2).max())
+        far = OUT * len(run) * float(np.sum(left_out(solution).residuals ** 2, axis=2).max())
+        own = float(np.median(np.diagonal(solution.problem.covariance, axis1=1, axis2=2)))
+        doubt[run] = min(far, LARGEST * own)
         self.state = replace(self.state, doubt=doubt)
         without = self.settle(MOST_ROUNDS)
         left, seen = left_out(without), self.data.seen[run]
@@ -232,13 +269,27 @@ def estimate(
         choose: Whether terms that do not better the left-out score go.
 
     Raises:
-        NotEnoughDataError: Too few points to place tracker and targets.
+        NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
     """
     data = data.in_order_of(robot.joint_names)
-    robot = _placed(robot, data)
+    try:
+        return _estimate(robot, data, model, load, robust, choose)
+    except np.linalg.LinAlgError:
+        need = len(robot.parameter_names)
+        message = "the measured configurations do not determine the robot's place: measure more that differ"
+        raise NotEnoughDataError(3 * int(data.seen.sum()), need, message) from None
+
+
+def _estimate(
+    robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None, robust: bool, choose: bool
+) -> ModelEstimate:
+    """The same for clean arguments."""
+    robot, far = _placed(robot, data)
     some = _some(data)
     part = data if some is None else data.select(some)
     work = _Work(robot, part, model, load if load is None or some is None else load[some])
+    if robust:
+        work.state = replace(work.state, doubt=far if some is None else far[some])
     work.settle(MOST_STARTS, 0)
     solution = work.settle(MOST_ROUNDS)
     if robust and work.state.model.scales:
@@ -273,12 +324,29 @@ def estimate(
     )
 
 
-def _placed(robot: Robot, data: Measurements) -> Robot:
-    """``robot`` with unknown base and targets where they fit the nominal chain best."""
+def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
+    """``robot`` with unknown base and targets where they fit the nominal chain best, and D of far points.
+
+    Each point weighs by how far it is from where the others put it (Cauchy, with the median as scale): some that are
+    wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the start.
+    """
     active = robot.parameter_names
     base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
     tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
-    return register(robot, data, base=base, tool=tool)
+    weights, seen = data.seen.astype(float), data.seen
+    poses = tip_poses(robot, data.q, at_base=base) if base or tool else None
+    for _ in range(CAUCHY_ROUNDS if poses else 1):
+        if poses:
+            put = place(robot, data, poses, base=base, tool=tool, weights=weights).of(robot, base=base, tool=tool)
+        else:
+            put = robot
+        length = np.linalg.norm(np.where(seen[:, :, None], data.p - put.positions(data.q), 0.0), axis=2)
+        median = max(float(np.median(length[seen])), LEAST)
+        new = np.where(seen, 1.0 / (1.0 + (length / median) ** 2), 0.0)
+        settled, weights = np.abs(new - weights).max() < 0.01, new
+        if settled:
+            break
+    return put, np.where(length > FAR * median, OUT * length**2, 0.0)
 
 
 def _some(data: Measurements) -> FloatArray | None:
@@ -331,8 +399,8 @@ def _worths(
     where = model.slices(problem.robot)
     placed = where.pop("placement")
     moved = {"placement": problem.columns[:, :, placed] @ state.coefficients[placed]}
-    for name, place in where.items():
-        moved[name] = problem.columns[:, :, place] @ state.coefficients[place]
+    for name, part in where.items():
+        moved[name] = problem.columns[:, :, part] @ state.coefficients[part]
     sizes = {n: float(np.sqrt(np.sum(v**2) / seen)) for n, v in moved.items()}
     visits = [p for n, p in problem.parts.items() if n in ("repeatability", "shared")]
     points = [p for n, p in problem.parts.items() if n in ("instrument", "floor")]

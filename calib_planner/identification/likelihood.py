@@ -42,6 +42,10 @@ RANK = 1e-7
 """Singular values of the flat columns, of unit length, below this share of the largest count as zero."""
 LONGEST_STEP = 1.5
 """Most that the logarithm of a scale changes in one step."""
+SMALLEST, LARGEST = 5e-3, 300.0
+"""Shares of its median between which a scale stays: smaller is none, and larger ones are gross errors' doing."""
+UNBOUNDED = 1e9
+"""The same where nothing is known of a scale; a factor from which on this is so."""
 SETTLED = 0.02
 """A step that promises less than this of −2 log L ends the search."""
 
@@ -407,8 +411,7 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
         if -(gradient @ step) < settled:
             break
         for _ in range(6):
-            values = {n: best.problem.model.values[n] * np.exp(s) for n, s in zip(names, step, strict=True)}
-            model = best.problem.model.with_values(values)
+            model = _moved(best.problem.model, names, step)
             trial = solve(best.problem.at(model))
             trial_prior = penalty(model, names)
             if trial.value + trial_prior[0] < best.value + prior:
@@ -418,3 +421,13 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
             break
         best, (prior, slope, curve) = trial, trial_prior
     return best
+
+
+def _moved(model: ErrorModel, names: tuple[str, ...], step: FloatArray) -> ErrorModel:
+    """The scales moved by ``step`` of their logarithms, within bounds where anything is known of them."""
+    chosen, values = {s.name: s for s in model.scales}, {}
+    for name, change in zip(names, step, strict=True):
+        scale = chosen[name]
+        low, high = (SMALLEST, LARGEST) if scale.factor < UNBOUNDED else (1.0 / UNBOUNDED, UNBOUNDED)
+        values[name] = float(np.clip(scale.value * np.exp(change), low * scale.median, high * scale.median))
+    return model.with_values(values)
