@@ -148,6 +148,12 @@ class Gravity:
         return np.stack([total[mass][:, j] for mass, j in self._pairs(robot)], axis=1)
 
 
+def downwards(robot: Robot, up: ArrayLike) -> tuple[float, float, float]:
+    """The mounting of a robot whose base pose is known, from the vertical ``up`` (3,) of the tracker's frame."""
+    x, y, z = -robot.base_pose[0].T @ check_array("up", up, (3,))
+    return float(x), float(y), float(z)
+
+
 def link_points(robot: Robot, q: FloatArray, joint: int | None, xyz: ArrayLike) -> FloatArray:
     """(N, 3) where ``xyz`` (3,) of the link that joint number ``joint`` moves is; ``None``: of the tip [m]."""
     branch = target_elements(check_array("mass", np.reshape(xyz, (1, 3)), (1, 3)))

@@ -142,6 +142,11 @@ class ErrorModel:
         return tuple(t for t in all_of_them if t is not None)
 
     @property
+    def is_papers(self) -> bool:
+        """Whether it is plain least squares: nothing but flat parameters and noise."""
+        return self.placement.prior == "flat" and not self.placement.stated and len(self.terms) == 2
+
+    @property
     def systematic(self) -> tuple[Placement | Gravity | JointFunctions, ...]:
         """Those that bring columns, placement first."""
         return tuple(t for t in (self.placement, self.gravity, self.joint_functions) if t is not None)

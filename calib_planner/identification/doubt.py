@@ -39,7 +39,7 @@ SWOLLEN = 0.6
 OUT = 10.0
 """Variance of what is impossible, as a multiple of its squared left-out residual."""
 LARGEST = 1e7
-"""Most by which a doubtful point's variance exceeds that of a good one: beyond it the point has no weight left."""
+"""Most by which a doubtful point's variance exceeds that of a good one: the point has no weight left."""
 FEWEST = 3
 """Visits of the shortest run."""
 

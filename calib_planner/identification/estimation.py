@@ -129,6 +129,7 @@ class _Work:
         self.robot, self.data, self.load = robot, data, load
         self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
         self.rounds, self.converged = 0, False
+        self.shifted = np.zeros(data.seen.shape)
 
     def linearised(self) -> LinearProblem:
         """(M1) at the state."""
@@ -193,44 +194,48 @@ class _Work:
 
     def doubt(self, solution: Solution) -> Solution:
         """Take the weight of what is impossible, and fit again."""
-        solution, run = self._shifted(solution)
+        solution = self._without_run(solution)
         if many_are_wrong(solution, self.state.doubt):
             for _ in range(STUDENT_ROUNDS):
                 old = self.state.doubt
-                new = np.maximum(student(solution, old), run)
+                new = np.maximum(student(solution, old), self.shifted)
                 self.state = replace(self.state, doubt=new)
                 solution = self.settle(1, 3)
                 own = np.trace(solution.problem.covariance, axis1=1, axis2=2).min() / new.shape[1]
                 if np.abs(np.log((new + own) / (old + own))).max() < 0.1:
                     break
-        for _ in range(MOST_DOUBTS):
+        return self.reconsider(solution, MOST_DOUBTS, 30)
+
+    def reconsider(self, solution: Solution, rounds: int, scales: int) -> Solution:
+        """Only what is impossible stays doubted; fit again as long as that changes."""
+        for _ in range(rounds):
             old = self.state.doubt
-            new = np.maximum(impossible(solution, old), run)
+            new = np.maximum(impossible(solution, old), self.shifted)
             if ((new > 0) == (old > 0)).all() and (new <= 2.0 * old).all():
                 break
             self.state = replace(self.state, doubt=new)
-            solution = self.settle(2)
+            solution = self.settle(2, scales)
         return solution
 
-    def _shifted(self, solution: Solution) -> tuple[Solution, FloatArray]:
-        """Without a run of visits that is shifted, if there is one that matters; D of its points."""
+    def _without_run(self, solution: Solution) -> Solution:
+        """Without the run of visits that is shifted, if there is one and it matters; its D is ``shifted``."""
         run, before = shifted_run(solution), (self.state, self.rounds, self.converged)
-        doubt = np.zeros(self.data.seen.shape)
         if run is None:
-            return solution, doubt
+            return solution
         far = OUT * len(run) * float(np.sum(left_out(solution).residuals ** 2, axis=2).max())
         own = float(np.median(np.diagonal(solution.problem.covariance, axis1=1, axis2=2)))
-        doubt[run] = min(far, LARGEST * own)
-        self.state = replace(self.state, doubt=doubt)
+        doubt = np.zeros(self.data.seen.shape)
+        doubt[run] = np.where(self.data.seen[run], min(far, LARGEST * own), 0.0)
+        self.state = replace(self.state, doubt=np.maximum(doubt, self.state.doubt))
         without = self.settle(MOST_ROUNDS)
-        left, seen = left_out(without), self.data.seen[run]
-        shift = left.residuals[run][seen].mean(axis=0)
+        shift = left_out(without).residuals[run][self.data.seen[run]].mean(axis=0)
         rest = without.problem.covariance[np.setdiff1d(np.arange(len(doubt)), run)]
         std = np.sqrt(np.median(np.trace(rest, axis1=1, axis2=2)) / doubt.shape[1])
         if np.linalg.norm(shift) > MATERIAL * std:
-            return without, np.where(self.data.seen, doubt, 0.0)
+            self.shifted = doubt
+            return without
         self.state, self.rounds, self.converged = before
-        return solution, np.zeros_like(doubt)
+        return solution
 
     def choose_terms(self, solution: Solution) -> tuple[Solution, dict[str, float]]:
         """Without the terms that do not better the left-out score; term → gain."""
@@ -265,13 +270,14 @@ def estimate(
         data: The measurements; the joint order may differ from the robot's.
         model: The terms, with their scales before the data.
         load: (N,) payload of each visit as a share of the largest one, or ``None``.
-        robust: Whether impossible points lose weight.
+        robust: Whether impossible points lose weight; never with the paper's model.
         choose: Whether terms that do not better the left-out score go.
 
     Raises:
         NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
     """
     data = data.in_order_of(robot.joint_names)
+    robust, choose = robust and not model.is_papers, choose and not model.is_papers
     try:
         return _estimate(robot, data, model, load, robust, choose)
     except np.linalg.LinAlgError:
@@ -292,7 +298,7 @@ def _estimate(
         work.state = replace(work.state, doubt=far if some is None else far[some])
     work.settle(MOST_STARTS, 0)
     solution = work.settle(MOST_ROUNDS)
-    if robust and work.state.model.scales:
+    if robust:
         solution = work.doubt(solution)
     gains: dict[str, float] = {}
     if choose:
@@ -302,14 +308,15 @@ def _estimate(
         solution = work.settle(MOST_ROUNDS, 0)
     scales = scale_covariance(solution)
     if some is not None:
-        doubt = np.zeros(data.seen.shape)
-        doubt[some] = work.state.doubt
         whole = _Work(robot, data, work.state.model, load)
+        near = np.clip(np.searchsorted(some, np.arange(len(data))), 0, len(some) - 1)
+        whole.shifted = np.where(data.seen, work.shifted[near].max(axis=1)[:, None], 0.0)
+        doubt = np.maximum(far, whole.shifted) if robust else np.zeros(data.seen.shape)
+        doubt[some] = work.state.doubt
         whole.state, whole.rounds = replace(work.state, doubt=doubt), work.rounds
         solution = whole.settle(2, 0)
-        for _ in range(2 if robust else 0):
-            whole.state = replace(whole.state, doubt=impossible(solution, whole.state.doubt))
-            solution = whole.settle(1, 0)
+        if robust:
+            solution = whole.reconsider(solution, 2, 0)
         work = whole
     hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
     known = Knowledge(robot, work.state.model, work.state.coefficients, covariance, hidden)
@@ -327,8 +334,9 @@ def _estimate(
 def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
     """``robot`` with unknown base and targets where they fit the nominal chain best, and D of far points.
 
-    Each point weighs by how far it is from where the others put it (Cauchy, with the median as scale): some that are
-    wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the start.
+    Each point weighs by how far it is from where the others put it (Cauchy, with the median as scale): some that
+    are wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the
+    start.
     """
     active = robot.parameter_names
     base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
@@ -381,12 +389,13 @@ def _without(problem: LinearProblem, term: str) -> LinearProblem:
 def _hidden(problem: LinearProblem) -> FloatArray:
     """(coefficients, directions) of flat coefficients that no point shows."""
     rows = problem.columns[:, :, problem.flat].reshape(problem.y.size, -1)
-    result = np.zeros((problem.columns.shape[2], rows.shape[1] - problem.basis.shape[1]))
+    rank = problem.basis.shape[1]
+    result = np.zeros((problem.columns.shape[2], rows.shape[1] - rank))
     if result.shape[1]:
         length = np.linalg.norm(rows, axis=0)
         length[length == 0.0] = 1.0
-        vectors = np.linalg.svd(rows / length, full_matrices=True)[2]
-        result[problem.flat] = vectors[problem.basis.shape[1] :].T / length[:, None]
+        vectors = np.linalg.svd(np.linalg.qr(rows / length, mode="r"))[2]
+        result[problem.flat] = vectors[rank:].T / length[:, None]
     return result
 
 

@@ -21,6 +21,7 @@ from calib_planner.error_model import (
     Visits,
     typical,
 )
+from calib_planner.error_model.gravity import downwards
 from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
@@ -143,6 +144,12 @@ def test_masses_stand_at_elbow_wrist_and_tip() -> None:
     names = [m.name for m in Gravity().masses_of(Robot.load("ur10e"))]
     assert names == ["elbow", "wrist", "tip"]
     assert [m.name for m in Gravity().masses_of(Robot.load("planar_2r"))] == ["tip"]
+
+
+def test_the_mounting_is_found_from_the_trackers_vertical() -> None:
+    tilted = Robot.load("ur10e").with_base([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], [1.0, 2.0, 3.0])
+    gravity = Gravity(mounting=downwards(tilted, [0.0, 0.0, 2.0]))
+    np.testing.assert_allclose(tilted.base_pose[0] @ gravity.down, [0.0, 0.0, -1.0], atol=1e-15)
 
 
 @pytest.mark.parametrize("mounting", ["wall", (0.0, 0.0, 0.0), (1.0, 2.0)])
