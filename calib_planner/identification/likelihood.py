@@ -406,7 +406,7 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
     for _ in range(rounds):
         gradient, information = derivatives(best, names)
         gradient, information = gradient + slope, information + np.diag(curve)
-        step: FloatArray = -np.linalg.solve(information, gradient)
+        step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
         step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
         if -(gradient @ step) < settled:
             break
