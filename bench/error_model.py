@@ -28,6 +28,7 @@ from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.files.measurements_csv import read_measurements
 from calib_planner.identification.estimation import ModelEstimate, estimate
 from calib_planner.identification.measurements import Measurements
+from calib_planner.instrument.noise import Isotropic, LaserTracker, Noise
 
 ROOT = Path(__file__).resolve().parents[1]
 INSIDE = 1.959964
@@ -106,67 +107,109 @@ def ur10(folder: Path, name: str, count: int, seeds: int) -> list[dict[str, Any]
 # ── simulated robots ─────────────────────────────────────────────────────────────────────────────────
 
 
+PLAIN = Isotropic(3e-5)
+
+
 @dataclass(frozen=True)
 class Kind:
-    """How a simulated robot errs: scales that are not zero, and whether its noise is Student t with ν = 3."""
+    """How a simulated robot errs and is measured.
+
+    Attributes:
+        name: For the table.
+        scales: Scales of the error model that are not nothing.
+        heavy: Noise of the points is Student t with 3 degrees of freedom.
+        backlash: Every joint stands half of this to one side or the other at a visit [rad].
+        targets: How many.
+        noise: The instrument; without it a point has 30 µm in each coordinate.
+        stated: Whether the estimator is told the noise.
+    """
 
     name: str
     scales: tuple[tuple[str, float], ...] = ()
     heavy: bool = False
+    backlash: float = 0.0
+    targets: int = 2
+    noise: Noise = PLAIN
+    stated: bool = False
 
 
+FAR = LaserTracker(station=np.array([15.0, 0.0, 1.0]))
+VISITS = (("repeatability", 1e-4), ("shared", 5e-5))
+ALL = (("gravity", 2e-3), ("smooth.size", 3e-4), ("short.size", 2e-4), ("repeatability", 5e-5))
 KINDS = (
     Kind("noise only"),
     Kind("gravity", (("gravity", 3e-3),)),
     Kind("smooth joints", (("smooth.size", 4e-4),)),
     Kind("short joints", (("short.size", 3e-4),)),
-    Kind("visits", (("repeatability", 1e-4), ("shared", 5e-5))),
-    Kind("all", (("gravity", 2e-3), ("smooth.size", 3e-4), ("short.size", 2e-4), ("repeatability", 5e-5))),
+    Kind("visits", VISITS),
+    Kind("visits, sigma stated", VISITS, stated=True),
+    Kind("all", ALL),
+    Kind("all, one target", ALL, targets=1),
+    Kind("gravity, six targets", (("gravity", 3e-3),), targets=6),
+    Kind("backlash", backlash=2e-4),
+    Kind("tracker at 15 m, stated", noise=FAR, stated=True),
     Kind("noise only, t3", heavy=True),
     Kind("gravity, t3", (("gravity", 3e-3),), heavy=True),
 )
 LIMITS = np.radians([[-170, 170], [-100, 60], [-100, 60], [-170, 170], [-100, 100], [-170, 170]])
+TARGETS = [
+    [0.0, 0.05, 0.1],
+    [0.08, -0.03, 0.05],
+    [-0.04, 0.02, 0.12],
+    [0.1, 0.1, 0.1],
+    [-0.1, 0.0, 0.05],
+    [0, -0.1, 0],
+]
 
 
-def simulated(kind: Kind, seed: int, robot: Robot, visits: int = 40, fresh: int = 300) -> dict[str, Any]:
-    """A robot drawn from the error model with some scales, measured and predicted."""
+def simulated(kind: Kind, seed: int, visits: int = 40, fresh: int = 300) -> dict[str, Any]:
+    """A robot drawn from the error model, measured and predicted."""
     rng = np.random.default_rng(seed)
+    robot = Robot.load("ur10e").with_targets(TARGETS[: kind.targets]).with_parameters("full")
     model = typical()
     small = {s.name: 1e-12 for s in model.scales if s.name not in ("smooth.length", "short.length")}
-    truth = small | {"placement.length": 3e-4, "placement.angle": 6e-4, "floor": 3e-5} | dict(kind.scales)
+    truth = small | {"placement.length": 3e-4, "placement.angle": 6e-4} | dict(kind.scales)
     true_model = model.with_values(truth)
-    variances = true_model.variances(robot)
-    beta = np.where(np.isfinite(variances), np.sqrt(np.where(np.isfinite(variances), variances, 0.0)), 0.0)
-    beta = beta * rng.standard_normal(len(beta))
+    beta = np.sqrt(true_model.variances(robot)) * rng.standard_normal(len(true_model.variances(robot)))
     q = rng.uniform(LIMITS[:, 0], LIMITS[:, 1], (visits + fresh, 6))
     known = Knowledge(robot, true_model, beta, np.zeros((len(beta),) * 2), np.zeros((len(beta), 0)))
-    poses = known.poses(q)
-    levers = np.zeros((len(q), 3 * len(robot.targets)))
-    values = true_model.values
-    levers += np.einsum("nij,nj->ni", poses.levers, values["repeatability"] * rng.standard_normal(q.shape))
-    levers += np.tile(values["shared"] * rng.standard_normal((len(q), 3)), len(robot.targets))
-    draw = rng.standard_t(3, levers.shape) / np.sqrt(3.0) if kind.heavy else rng.standard_normal(levers.shape)
-    points = poses.points + (levers + values["floor"] * draw).reshape(len(q), -1, 3)
-    data = Measurements(robot.joint_names, q, points)
+    poses, values = known.poses(q), true_model.values
+    joints = values["repeatability"] * rng.standard_normal(q.shape)
+    joints += 0.5 * kind.backlash * rng.choice([-1.0, 1.0], q.shape)
+    error = np.einsum("nij,nj->ni", poses.levers, joints)
+    error += np.tile(values["shared"] * rng.standard_normal((len(q), 3)), kind.targets)
+    shape = (len(q), kind.targets, 3)
+    draw = rng.standard_t(3, shape) / np.sqrt(3.0) if kind.heavy else rng.standard_normal(shape)
+    noise = (np.linalg.cholesky(kind.noise.covariance(poses.points)) @ draw[..., None])[..., 0]
+    data = Measurements(robot.joint_names, q, poses.points + error.reshape(shape) + noise)
     nominal = robot.with_parameters("full", ("base", "tool"))
-    found, seconds = timed(nominal, data.select(np.arange(visits)), typical())
+    stated = typical(kind.noise if kind.stated else None)
+    found, seconds = timed(nominal, data.select(np.arange(visits)), stated)
     row = judge(found.knowledge, data.select(np.arange(visits, len(q))), found, seconds)
+    told = found.knowledge.predict(q[visits:])
+    std = np.sqrt(np.diagonal(told.position, axis1=2, axis2=3))
+    row["positions"] = float(np.mean(np.abs(told.mean - poses.points[visits:]) <= INSIDE * std))
+    at = [found.knowledge.robot.parameter_names.index(n) for n in robot.parameter_names]
+    std = np.sqrt(np.diag(found.knowledge.covariance)[at])
+    apart = found.knowledge.coefficients[at] - beta[: len(at)]
+    row["parameters"] = float(np.mean(np.abs(apart) <= INSIDE * std))
+    row["doubted"] = float((found.doubt > 0).any())
     return {"case": f"simulated: {kind.name}", "scales": found.knowledge.model.values, **row}
 
 
-def many(robot: Robot) -> dict[str, Any]:
+def many() -> dict[str, Any]:
     """1 000 visits × 3 targets of a robot with every term, for the time it takes."""
-    three = robot.with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05], [-0.04, 0.02, 0.12]])
-    return simulated(Kind("1000 visits x 3", KINDS[5].scales), 0, three, visits=1000)
+    return simulated(Kind("1000 visits x 3", ALL, targets=3), 0, visits=1000)
 
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Means over the seeds of every case."""
     keys = ("mean_mm", "rms_mm", "predicted", "left_out_mm", "inside", "seconds")
+    keys += ("positions", "parameters", "doubted")
     print(f"{'case':<30} {'seeds':>5} " + " ".join(f"{k:>11}" for k in keys))
     for case in dict.fromkeys(r["case"] for r in rows):
         part = [r for r in rows if r["case"] == case]
-        means = " ".join(f"{np.mean([r[k] for r in part]):11.3f}" for k in keys)
+        means = " ".join(f"{np.mean([r.get(k, np.nan) for r in part]):11.3f}" for k in keys)
         print(f"{case:<30} {len(part):5d} {means}", flush=True)
 
 
@@ -183,10 +226,9 @@ def main() -> None:
         rows += irb120(args.data / "irb120_tracker")
         for name, count in (("random_poses", 100), ("random_poses", 30), ("joint_sweeps", 100)):
             rows += ur10(args.data / "ur10_tracker", name, count, args.seeds)
-    robot = Robot.load("ur10e").with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05]]).with_parameters("full")
     for kind in KINDS:
-        rows += [simulated(kind, seed, robot) for seed in range(args.simulated)]
-    rows.append(many(robot))
+        rows += [simulated(kind, seed) for seed in range(args.simulated)]
+    rows.append(many())
     show(rows)
     if args.json:
         args.json.write_text(json.dumps({"error_model": rows}, indent=1) + "\n", encoding="utf-8")
