@@ -204,8 +204,8 @@ def many() -> dict[str, Any]:
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Means over the seeds of every case."""
-    keys = ("mean_mm", "rms_mm", "predicted", "left_out_mm", "inside", "seconds")
-    keys += ("positions", "parameters", "doubted")
+    keys = ["mean_mm", "rms_mm", "predicted", "left_out_mm", "inside", "seconds"]
+    keys += ["positions", "parameters", "doubted"]
     print(f"{'case':<30} {'seeds':>5} " + " ".join(f"{k:>11}" for k in keys))
     for case in dict.fromkeys(r["case"] for r in rows):
         part = [r for r in rows if r["case"] == case]

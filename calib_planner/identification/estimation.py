@@ -7,9 +7,8 @@
     3. doubt      Where points or a run of visits are impossible beside the others, these lose their weight
                   (``doubt``).
     4. terms      A term that does not better the left-out score goes (``left_out``).
-    5. all        Many points: 1 to 4 are done with some of the visits, and generalised least squares at the
-    scales
-                  found with all of them.
+    5. all        Many points: 1 to 4 are done with some of the visits; generalised least squares at the scales
+                  found is done with all of them.
 
 The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
 """
@@ -45,6 +44,8 @@ from calib_planner.identification.likelihood import (
 )
 from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.registration import place, tip_poses
+from calib_planner.identification.term_worth import TermWorth, term_worths
+from calib_planner.instrument.noise import Isotropic
 from calib_planner.robot.chain import Robot
 
 MOST_STARTS = 20
@@ -71,23 +72,6 @@ ENOUGH = 450
 """Coordinates from which scales and terms are decided; more visits than that do not take part."""
 OPTIONAL = ("short", "smooth", "gravity")
 """Terms that have to better the left-out score."""
-
-
-@dataclass(frozen=True, eq=False)
-class TermWorth:
-    """What a term is worth.
-
-    Attributes:
-        name: ``placement``, ``gravity``, ``smooth``, ``short``, ``visits`` or ``points``.
-        size: Root mean square of what it moves a measured point by [m]; 0 if the term went.
-        gain: Left-out log score with it less that without; NaN where it is not asked.
-        kept: Whether it is in the model.
-    """
-
-    name: str
-    size: float
-    gain: float
-    kept: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +107,17 @@ class _State:
 
 
 class _Work:
-    """The measurements, and a state that goes from one relinearisation to the next."""
+    """The measurements, and a state that goes from one relinearisation to the next.
+
+    Attributes:
+        robot: With base and targets about where they are; β are deviations from it.
+        data: The visits that take part.
+        load: (N,) payload of each visit as a share of the largest one, or ``None``.
+        state: Where it is linearised.
+        rounds: Relinearisations made.
+        converged: Whether the predictions stood still in the last one.
+        shifted: (N, targets) D of the points of a run of visits that is shifted [m²]; 0 for all others.
+    """
 
     def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
         self.robot, self.data, self.load = robot, data, load
@@ -178,6 +172,7 @@ class _Work:
         return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
 
     def _poses(self, coefficients: FloatArray) -> Poses:
+        """Parameters and deflected joints at β (coefficients,)."""
         names = self.robot.parameter_names
         here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
         poses = Poses(here, self.data.q, self.load)
@@ -250,8 +245,8 @@ class _Work:
             worst = min(found, key=lambda t: found[t])
             before = self.state
             solution = trials[worst]
-            place = _place(before.model, solution.problem.model, self.robot)
-            self.state = replace(before, coefficients=before.coefficients[place], model=solution.problem.model)
+            kept = _place(before.model, solution.problem.model, self.robot)
+            self.state = replace(before, coefficients=before.coefficients[kept], model=solution.problem.model)
 
 
 def estimate(
@@ -319,12 +314,17 @@ def _estimate(
             solution = whole.reconsider(solution, 2, 0)
         work = whole
     hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
-    known = Knowledge(robot, work.state.model, work.state.coefficients, covariance, hidden)
+    told = work.state.model
+    if data.std is not None and told.points.noise is None:
+        # What was said of these points is what is expected of others.
+        usual = Isotropic(float(np.sqrt(np.mean(np.asarray(data.std)[data.seen] ** 2))))
+        told = replace(told, points=replace(told.points, noise=usual))
+    known = Knowledge(robot, told, work.state.coefficients, covariance, hidden)
     return ModelEstimate(
         knowledge=known,
         left_out=left_out(solution),
         doubt=work.state.doubt,
-        terms=_worths(model, work.state, solution, gains),
+        terms=term_worths(model, solution.problem, work.state.coefficients, gains),
         solution=solution,
         rounds=work.rounds,
         converged=work.converged,
@@ -397,34 +397,3 @@ def _hidden(problem: LinearProblem) -> FloatArray:
         vectors = np.linalg.svd(np.linalg.qr(rows / length, mode="r"))[2]
         result[problem.flat] = vectors[rank:].T / length[:, None]
     return result
-
-
-def _worths(
-    asked: ErrorModel, state: _State, solution: Solution, gains: dict[str, float]
-) -> tuple[TermWorth, ...]:
-    """Every term asked for."""
-    problem, model = solution.problem, state.model
-    seen = max(problem.seen.sum() / 3.0, 1.0)
-    where = model.slices(problem.robot)
-    placed = where.pop("placement")
-    moved = {"placement": problem.columns[:, :, placed] @ state.coefficients[placed]}
-    for name, part in where.items():
-        moved[name] = problem.columns[:, :, part] @ state.coefficients[part]
-    sizes = {n: float(np.sqrt(np.sum(v**2) / seen)) for n, v in moved.items()}
-    visits = [p for n, p in problem.parts.items() if n in ("repeatability", "shared")]
-    points = [p for n, p in problem.parts.items() if n in ("instrument", "floor")]
-    for name, parts in (("visits", visits), ("points", points)):
-        traces = sum(np.trace(p, axis1=1, axis2=2) for p in parts)
-        sizes[name] = (
-            float(np.sqrt(np.median(traces / np.maximum(problem.seen.sum(axis=1) / 3.0, 1.0)))) if parts else 0.0
-        )
-    result = []
-    for term in asked.terms:
-        names = asked.joint_functions.components if term is asked.joint_functions else (term.name,)
-        kept = {t.name for t in model.terms} | set(
-            model.joint_functions.components if model.joint_functions else ()
-        )
-        for name in names:
-            size = sizes.get(term.name, 0.0) if name in kept else 0.0
-            result.append(TermWorth(name, size, gains.get(name, float("nan")), name in kept))
-    return tuple(result)
