@@ -1,0 +1,289 @@
+"""What is known of a robot, and what that is worth: (M2), (M3) and the prediction of any point.
+
+Measuring the configurations q_i gives, with the columns J⁺ of parameters and other coefficients β, their prior
+precision M₀ and the covariance R_i of a visit,
+
+    M = M₀ + Σ_i J⁺_iᵀ R_i⁻¹ J⁺_i ,     C = M⁻¹ .                                                            (M2)
+
+What remains uncertain at test poses, stacked in J⁺_0 (rows x, y, z of every pose and target), is one of two
+things. *world* is the error of the position in the frame of the points,
+
+    ρ0² = trace(J⁺_0 C J⁺_0ᵀ) / (poses · targets) ,                                                          (M3)
+
+eq. (14) for one pose and target. *robot* is the same up to a rigid motion of the base, for users who register the
+robot anew: a small motion moves a point p by a + b × p, the columns G = [I, −p×]; what it explains is taken off,
+
+    ρ² = trace(Q J⁺_0 C J⁺_0ᵀ Q) / (poses · targets) ,      Q = I − G (GᵀG)⁻¹ Gᵀ .
+
+Neither depends on how the parameters are chosen. A direction of β that no measurement and no prior shows (a zero
+eigenvalue of M) makes both infinite if the test poses feel it, and nothing otherwise.
+
+The covariance of a predicted measurement is a sum of four: *parameters*, which remain uncertain even if all other
+coefficients were known, J (M_ΠΠ)⁻¹ Jᵀ; *systematic*, what the uncertainty of gravity and joint functions adds to
+that, J⁺ C J⁺ᵀ − J (M_ΠΠ)⁻¹ Jᵀ; *repeatability*, of the visit; and *noise*, of the point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_planner._arrays import FloatArray, check_configurations
+from calib_planner.error_model.model import ErrorModel
+from calib_planner.error_model.poses import Poses
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.robot.chain import Robot
+
+ACCURACIES = ("world", "robot")
+ROUNDING = 1e-13
+"""Eigenvalues of the information, scaled to unit diagonal, below this are zero."""
+FLATTEST = 1e-3
+"""Test poses whose points are thinner than this share of their extent lie in a plane."""
+UNKNOWN = 1.0
+"""Standard deviation of a target that has just been put on [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Predicted measurements of N configurations.
+
+    Attributes:
+        mean: (N, targets, 3) positions [m].
+        parameters, systematic, repeatability, noise: (N, targets, 3, 3) covariances [m²].
+    """
+
+    mean: FloatArray
+    parameters: FloatArray
+    systematic: FloatArray
+    repeatability: FloatArray
+    noise: FloatArray
+
+    @property
+    def position(self) -> FloatArray:
+        """(N, targets, 3, 3) covariance of where the point is on average: parameters and systematic [m²]."""
+        return self.parameters + self.systematic
+
+    @property
+    def total(self) -> FloatArray:
+        """(N, targets, 3, 3) covariance of measured − predicted [m²]."""
+        return self.position + self.repeatability + self.noise
+
+
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """(M3) at test poses.
+
+    Attributes:
+        kind: ``world`` or ``robot``.
+        value: Root mean square over poses and targets [m]; infinite if the test poses need what is not known.
+        per_pose: (K,) the same of each pose [m].
+    """
+
+    kind: str
+    value: float
+    per_pose: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """Mean and covariance of the coefficients of one robot.
+
+    Attributes:
+        robot: Nominal, with base and targets about where they are; its active parameters come first in β.
+        model: How it errs.
+        coefficients: (coefficients,) mean of β: deviations of the active parameters, then the others.
+        covariance: (coefficients, coefficients) C, zero in hidden directions.
+        hidden: (coefficients, directions) directions that nothing shows.
+    """
+
+    robot: Robot
+    model: ErrorModel
+    coefficients: FloatArray
+    covariance: FloatArray
+    hidden: FloatArray
+
+    @staticmethod
+    def of_plan(
+        robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None, repetitions: int = 1
+    ) -> Knowledge:
+        """What measuring ``q`` (N, joints) ``repetitions`` times each will tell; the mean stays at nominal."""
+        matrix = prior_information(robot, model) + repetitions * information(robot, model, q, load).sum(axis=0)
+        return Knowledge.from_information(robot, model, matrix)
+
+    @staticmethod
+    def from_information(robot: Robot, model: ErrorModel, matrix: FloatArray) -> Knowledge:
+        """The inverse of M on the space that it shows; ``matrix`` (coefficients, coefficients)."""
+        diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+        scale = np.where(diagonal > 0.0, diagonal, 1.0)
+        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+        shown = values > ROUNDING * max(float(values[-1]), 1e-300)
+        half = vectors[:, shown] / np.sqrt(values[shown]) / scale[:, None]
+        hidden = vectors[:, ~shown] / scale[:, None]
+        return Knowledge(robot, model, np.zeros(len(matrix)), half @ half.T, hidden)
+
+    # ── prediction ───────────────────────────────────────────────────────────────────────────────────
+
+    def poses(self, q: ArrayLike, load: FloatArray | None = None) -> Poses:
+        """Configurations (N, joints) with parameters and deflections at their means."""
+        clean = check_configurations("configurations", q, self.robot.joint_names)
+        names = self.robot.parameter_names
+        deviations = dict(zip(names, self.coefficients[: len(names)], strict=True))
+        robot = self.robot.with_deviations(deviations)
+        readings = Poses(robot, clean, load)
+        return replace(readings, deflection=self.model.deflection(readings, self.coefficients))
+
+    def predict(self, q: ArrayLike, load: FloatArray | None = None) -> Prediction:
+        """Mean and covariance of what would be measured at ``q`` (N, joints) [rad | m]."""
+        poses = self.poses(q, load)
+        n, targets = len(poses), len(self.robot.targets)
+        columns = self.model.columns(poses).reshape(n, targets, 3, -1)
+        count = len(self.robot.parameter_names)
+        own = _spread(columns[..., :count], self._parameters_alone)
+        noise = _diagonal_blocks(self.model.visit_covariance(poses, points_only=True), targets)
+        both = _diagonal_blocks(self.model.visit_covariance(poses), targets)
+        return Prediction(poses.points, own, _spread(columns, self.covariance) - own, both - noise, noise)
+
+    @cached_property
+    def _parameters_alone(self) -> FloatArray:
+        """(P, P) covariance of the parameters if all other coefficients were known."""
+        count = len(self.robot.parameter_names)
+        own, cross = self.covariance[:count, :count], self.covariance[:count, count:]
+        if not cross.shape[1]:
+            return own
+        scale = np.sqrt(np.maximum(np.diag(self.covariance)[count:], 0.0))
+        scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+        rest = self.covariance[count:, count:] * np.outer(scale, scale)
+        scaled = cross * scale
+        return own - scaled @ np.linalg.pinv(rest, rcond=1e-12, hermitian=True) @ scaled.T
+
+    # ── accuracy ─────────────────────────────────────────────────────────────────────────────────────
+
+    def accuracy(self, test_poses: ArrayLike, kind: str = "world", load: FloatArray | None = None) -> Accuracy:
+        """(M3) at ``test_poses`` (K, joints).
+
+        Raises:
+            UnknownNameError: ``kind`` is neither ``world`` nor ``robot``.
+            InputError: ``robot`` for fewer than four test poses, or for points in a line or a plane.
+        """
+        if kind not in ACCURACIES:
+            raise UnknownNameError("accuracy", kind, ACCURACIES)
+        poses = self.poses(test_poses, load)
+        rows = self.model.columns(poses).reshape(-1, len(self.coefficients))
+        values, vectors = np.linalg.eigh(self.covariance)
+        half = rows @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        unseen = rows @ self.hidden
+        if kind == "robot":
+            half, unseen = (without_rigid_motion(poses.points, part) for part in (half, unseen))
+        squares = np.sum(half**2, axis=1).reshape(len(poses), -1)
+        if unseen.size:
+            felt = np.abs(unseen).max(axis=1) > 1e-6 * np.abs(rows).max() * np.abs(self.hidden).max()
+            squares[felt.reshape(squares.shape)] = np.inf
+        per_pose = np.sqrt(squares.sum(axis=1) / len(self.robot.targets))
+        return Accuracy(kind, float(np.sqrt(np.mean(per_pose**2))), per_pose)
+
+    # ── a few more points ────────────────────────────────────────────────────────────────────────────
+
+    def with_new_targets(self, xyz: ArrayLike) -> Knowledge:
+        """The same robot with targets put on anew, about at ``xyz`` (targets, 3) of the tip's frame [m].
+
+        Nothing is known of their places but that (``UNKNOWN``); a few points tell them (``updated``).
+        """
+        names = self.model.names(self.robot)
+        count = len(self.robot.parameter_names)
+        kept = [i for i, n in enumerate(names) if i >= count or not n.startswith("target_")]
+        robot = self.robot.with_targets(xyz)
+        chain = [n for n in self.robot.parameter_names if not n.startswith("target_")]
+        new = [f"target_{t + 1}.{a}" for t in range(len(robot.targets)) for a in "xyz"]
+        robot = replace(robot, parameter_names=(*chain, *new))
+        old = [kept.index(names.index(n)) for n in chain]
+        place = np.array([*old, *([-1] * len(new)), *range(len(chain), len(kept))])
+        there = place >= 0
+        coefficients = np.where(there, self.coefficients[kept][place], 0.0)
+        covariance = self.covariance[np.ix_(kept, kept)][np.ix_(place, place)] * np.outer(there, there)
+        covariance[~there, ~there] = UNKNOWN**2
+        hidden = self.hidden[kept][place] * there[:, None]
+        return Knowledge(robot, self.model, coefficients, covariance, hidden)
+
+    def updated(
+        self, q: ArrayLike, points: FloatArray, seen: NDArray[np.bool_] | None = None, rounds: int = 3
+    ) -> Knowledge:
+        """With a few more visits ``q`` (N, joints) and their ``points`` (N, targets, 3) [m]; the scales stay.
+
+        Linearised anew ``rounds`` times at the new mean. ``seen`` (N, targets): which points were measured.
+        """
+        mean, mask = self.coefficients, np.ones(points.shape[:2], bool) if seen is None else seen
+        use = np.repeat(mask, 3, axis=1).ravel()
+        for _ in range(rounds):
+            poses = replace(self, coefficients=mean).poses(q)
+            columns = self.model.columns(poses)
+            rows = columns.reshape(-1, len(mean))[use]
+            apart = np.where(mask[:, :, None], points - poses.points, 0.0).ravel()[use]
+            covariance = _block_diagonal(self.model.visit_covariance(poses))[np.ix_(use, use)]
+            gain = self.covariance @ rows.T
+            inner = np.linalg.cholesky(rows @ gain + covariance)
+            white = np.linalg.solve(inner, gain.T)
+            right = np.linalg.solve(inner, apart + rows @ (mean - self.coefficients))
+            mean = self.coefficients + white.T @ right
+        return replace(self, coefficients=mean, covariance=self.covariance - white.T @ white)
+
+
+def prior_information(robot: Robot, model: ErrorModel) -> FloatArray:
+    """M₀ (coefficients, coefficients), zero where flat."""
+    return np.diag(1.0 / model.variances(robot))
+
+
+def information(robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None) -> FloatArray:
+    """J⁺_iᵀ R_i⁻¹ J⁺_i of each configuration (N, joints): (N, coefficients, coefficients)."""
+    clean = check_configurations("configurations", q, robot.joint_names)
+    poses = Poses(robot, clean, load)
+    columns = model.columns(poses)
+    white = np.linalg.solve(np.linalg.cholesky(model.visit_covariance(poses)), columns)
+    return np.asarray(white.transpose(0, 2, 1) @ white)
+
+
+def without_rigid_motion(points: FloatArray, rows: FloatArray) -> FloatArray:
+    """What a common small motion of all points does not explain: Q · rows.
+
+    Args:
+        points: (K, targets, 3) at the test poses [m].
+        rows: (3·K·targets, n).
+
+    Raises:
+        InputError: Fewer than four test poses, or all points in a line or a plane.
+    """
+    advice = "give at least four test poses that are not in one plane, or ask for the accuracy 'world'"
+    if len(points) < 4:
+        raise InputError("test_poses", f"{len(points)} poses", "at least 4 for the accuracy 'robot'", advice)
+    flat = points.reshape(-1, 3)
+    centred = flat - flat.mean(axis=0)
+    extent = np.linalg.svd(centred, compute_uv=False)
+    if not extent[2] > FLATTEST * extent[0]:
+        raise InputError("test_poses", "points in a line or a plane", "points in space", advice)
+    turns = np.cross(np.eye(3)[None], centred[:, None, :]).transpose(0, 2, 1)  # b × p
+    motion = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2).reshape(-1, 6)
+    basis = np.linalg.qr(motion)[0]
+    return np.asarray(rows - basis @ (basis.T @ rows))
+
+
+def _spread(columns: FloatArray, matrix: FloatArray) -> FloatArray:
+    """J C Jᵀ of every target: columns (N, targets, 3, K) → (N, targets, 3, 3)."""
+    half = (columns.reshape(-1, columns.shape[-1]) @ matrix).reshape(columns.shape)
+    return np.asarray(half @ columns.swapaxes(2, 3))
+
+
+def _diagonal_blocks(covariance: FloatArray, targets: int) -> FloatArray:
+    """(N, 3·targets, 3·targets) → (N, targets, 3, 3)."""
+    every = np.arange(targets)
+    blocks = covariance.reshape(-1, targets, 3, targets, 3)[:, every, :, every, :]
+    return np.asarray(np.moveaxis(blocks, 0, 1))
+
+
+def _block_diagonal(blocks: FloatArray) -> FloatArray:
+    """(N, m, m) → (N·m, N·m)."""
+    n, m, _ = blocks.shape
+    result = np.zeros((n, m, n, m))
+    result[np.arange(n), :, np.arange(n), :] = blocks
+    return result.reshape(n * m, n * m)

@@ -1,0 +1,125 @@
+"""Where the parts of the robot, its base and its targets are: the parameters of the chain, eq. (1)–(3).
+
+The columns are those of the identification Jacobian, ∂g/∂Π. What is known of a parameter before the data is a
+normal distribution around its nominal value, or nothing (a *flat* prior, precision zero, as in the paper). Base
+and targets are where somebody has put them: they are always flat. A part of the chain is made to a tolerance: a
+length is within ``placement.length`` and an angle within ``placement.angle`` of the data sheet, two standard
+deviations of the error model. The zero of a joint is set by hand and hardly known (``ZERO``). A prior that the
+user states for some parameters replaces the tolerance of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_planner._arrays import FloatArray
+from calib_planner.error_model.poses import Poses
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.robot.chain import Robot
+
+ZERO = 0.02
+"""Standard deviation of the zero of a joint, in any unit [rad | m]."""
+BoolArray = NDArray[np.bool_]
+PRIORS = ("tolerance", "flat")
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The parameters of the chain.
+
+    Attributes:
+        prior: ``tolerance`` or ``flat``.
+        stated: Standard deviations that the user knows, as (parameter name, standard deviation [m | rad]).
+    """
+
+    prior: str = "tolerance"
+    stated: tuple[tuple[str, float], ...] = ()
+
+    name: ClassVar[str] = "placement"
+    title: ClassVar[str] = "lengths, axes and zeros of the chain"
+
+    def __post_init__(self) -> None:
+        if self.prior not in PRIORS:
+            raise UnknownNameError("placement.prior", self.prior, PRIORS)
+        names = [name for name, _ in self.stated]
+        if len(set(names)) < len(names):
+            raise InputError("placement.stated", ", ".join(names), "every parameter once")
+        for name, std in self.stated:
+            if not 0.0 < std < np.inf:
+                raise InputError(f"prior of {name}", std, "a standard deviation > 0 [m | rad]")
+
+    @property
+    def scales(self) -> tuple[str, ...]:
+        """Names of the standard deviations of the error model that this term uses."""
+        return ("placement.length", "placement.angle") if self.prior == "tolerance" else ()
+
+    def names(self, robot: Robot) -> tuple[str, ...]:
+        """P names, the order of the columns."""
+        return robot.parameter_names
+
+    def size(self, robot: Robot) -> int:
+        """P."""
+        return len(robot.parameter_names)
+
+    def columns(self, poses: Poses) -> FloatArray:
+        """(N, 3·targets, P) ∂position/∂parameter [m/m | m/rad]."""
+        return poses.jacobian
+
+    def variances(self, robot: Robot, values: dict[str, float]) -> FloatArray:
+        """(P,) prior variance of each parameter [m² | rad²], infinite where it is flat."""
+        variances = np.full(len(robot.parameter_names), np.inf)
+        for name, rows in self._rows(robot).items():
+            variances[rows] = values[name] ** 2
+        if self.prior == "tolerance":
+            variances[joint_zeros(robot)] = ZERO**2
+        for name, std in self.stated:
+            if name not in robot.parameter_names:
+                raise UnknownNameError("prior", name, robot.parameter_names)
+            variances[robot.parameter_names.index(name)] = std**2
+        return variances
+
+    def slopes(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
+        """Scale → (P,) derivative of ``variances`` by its logarithm."""
+        result: dict[str, FloatArray] = {}
+        for name, rows in self._rows(robot).items():
+            slope = np.zeros(len(robot.parameter_names))
+            slope[rows] = 2.0 * values[name] ** 2
+            result[name] = slope
+        return result
+
+    def _rows(self, robot: Robot) -> dict[str, BoolArray]:
+        """Scale → (P,) whether a parameter's prior is that scale."""
+        free = is_placement(robot.parameter_names) & ~joint_zeros(robot)
+        free &= np.array([n not in dict(self.stated) for n in robot.parameter_names], bool)
+        angle = np.array([p.unit == "rad" for p in robot.parameters], bool)
+        rows = {"placement.length": free & ~angle, "placement.angle": free & angle}
+        return {n: r for n, r in rows.items() if n in self.scales and r.any()}
+
+
+@lru_cache(maxsize=64)
+def joint_zeros(robot: Robot) -> BoolArray:
+    """(P,) whether a parameter acts as a joint does, wherever the robot stands.
+
+    Of two that act alike (a joint's offset and a rotation about the same axis) both are zeros.
+    """
+    names = robot.parameter_names
+    low, high = robot.joint_limits.T
+    sample = np.random.default_rng(0).uniform(low, high, (8, len(low)))
+    # Targets off every axis: an unknown one starts at the tip, where the last joint moves nothing.
+    robot = robot.with_targets(robot.target_offsets + np.array([0.13, 0.17, 0.19]))
+    columns, joints = robot.jacobian(sample), robot.joint_jacobian(sample)
+    least = 1e-9 * np.abs(joints).max()
+    like = [np.abs(columns[..., :, None] - s * joints[..., None, :]).max(axis=(0, 1)) < least for s in (1, -1)]
+    acts = dict(zip(robot.parameter_names, (like[0] | like[1]).any(axis=1), strict=True))
+    return np.array([acts.get(n, False) for n in names], bool) & is_placement(names)
+
+
+def is_placement(names: Sequence[str]) -> BoolArray:
+    """(P,) whether a parameter belongs to the chain; the others place the base or a target."""
+    return np.array([not n.startswith(("base.", "target_")) for n in names], bool)

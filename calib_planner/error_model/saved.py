@@ -1,0 +1,131 @@
+"""The error model as plain data, for YAML: alone or as a part of an estimate.
+
+``to_mapping`` gives dictionaries, lists, numbers and strings; ``from_mapping`` reads them back to an equal model
+and refuses what it does not know, naming the key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+
+from calib_planner.error_model.gravity import Gravity, Mass
+from calib_planner.error_model.joint_functions import JointFunctions
+from calib_planner.error_model.model import ErrorModel, Scale
+from calib_planner.error_model.placement import Placement
+from calib_planner.error_model.points import Points
+from calib_planner.error_model.visits import Visits
+from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.instrument.noise import Isotropic, LaserTracker, Noise
+
+NOISES = {"isotropic": Isotropic, "laser_tracker": LaserTracker}
+
+
+def to_mapping(model: ErrorModel) -> dict[str, Any]:
+    """Plain data that hold the whole model."""
+    gravity, functions, visits = model.gravity, model.joint_functions, model.visits
+    points: dict[str, Any] = {"estimate_scale": model.points.estimate_scale, "floor": model.points.floor}
+    if model.points.noise is not None:
+        points["noise"] = _noise_mapping(model.points.noise)
+    return {
+        "name": model.name,
+        "placement": {"prior": model.placement.prior, "stated": dict(model.placement.stated)},
+        "gravity": None if gravity is None else _plain(asdict(gravity)),
+        "joint_functions": None if functions is None else _plain(asdict(functions)),
+        "visits": None if visits is None else asdict(visits),
+        "points": points,
+        "scales": {s.name: {k: v for k, v in asdict(s).items() if k != "name"} for s in model.scales},
+    }
+
+
+def from_mapping(data: Mapping[str, Any], field: str = "error_model") -> ErrorModel:
+    """The model of ``to_mapping``.
+
+    Args:
+        data: What was read.
+        field: Where it stood, for messages.
+
+    Raises:
+        InputError: A key is missing, unknown, or holds what it cannot hold; names the key.
+    """
+    parts = {f.name for f in fields(ErrorModel)}
+    _check_keys(field, data, parts, parts)
+    try:
+        placement = _section(field, data, "placement", {"prior", "stated"})
+        points = dict(_section(field, data, "points", {"noise", "estimate_scale", "floor"}))
+        noise = None if points.get("noise") is None else _noise(f"{field}.points.noise", points["noise"])
+        gravity = _optional(field, data, "gravity", {"masses", "mounting"})
+        functions = _optional(field, data, "joint_functions", {"components", "harmonics"})
+        visits = _optional(field, data, "visits", {"joints", "shared"})
+        return ErrorModel(
+            placement=Placement(placement["prior"], tuple(dict(placement["stated"]).items())),
+            gravity=None if gravity is None else _gravity(f"{field}.gravity", gravity),
+            joint_functions=None
+            if functions is None
+            else JointFunctions(tuple(functions["components"]), functions["harmonics"]),
+            visits=None if visits is None else Visits(**visits),
+            points=Points(noise, bool(points["estimate_scale"]), bool(points["floor"])),
+            scales=tuple(Scale(name, **values) for name, values in dict(data["scales"]).items()),
+            name=str(data["name"]),
+        )
+    except CalibPlannerError:
+        raise
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        advice = "compare with config/error_models/typical.yaml or save the model anew"
+        raise InputError(field, f"{type(error).__name__}: {error}", "a saved error model", advice) from None
+
+
+def _gravity(field: str, data: Mapping[str, Any]) -> Gravity:
+    masses = []
+    for k, mass in enumerate(data["masses"]):
+        _check_keys(f"{field}.masses[{k}]", mass, {"name", "joint", "xyz", "weight"}, {"name"})
+        masses.append(Mass(**{**mass, "xyz": tuple(mass.get("xyz", (0.0, 0.0, 0.0)))}))
+    mounting = data["mounting"]
+    return Gravity(tuple(masses), mounting if isinstance(mounting, str) else tuple(mounting))
+
+
+def _noise(field: str, data: Mapping[str, Any]) -> Noise:
+    kind = data.get("kind")
+    if kind not in NOISES:
+        raise UnknownNameError(f"{field}.kind", str(kind), tuple(NOISES))
+    known = {f.name for f in fields(NOISES[kind])}
+    _check_keys(field, data, {"kind", *known}, {"kind"})
+    return NOISES[kind](**{k: v for k, v in data.items() if k != "kind"})
+
+
+def _noise_mapping(noise: Noise) -> dict[str, Any]:
+    for kind, made in NOISES.items():
+        if isinstance(noise, made):
+            return {"kind": kind, **{f.name: _plain(getattr(noise, f.name)) for f in fields(made)}}
+    raise InputError("points.noise", type(noise).__name__, f"one of {', '.join(NOISES)} to be saved")
+
+
+def _section(field: str, data: Mapping[str, Any], key: str, known: set[str]) -> Mapping[str, Any]:
+    _check_keys(f"{field}.{key}", data[key], known, known - {"noise"})
+    return dict(data[key])
+
+
+def _optional(field: str, data: Mapping[str, Any], key: str, known: set[str]) -> Mapping[str, Any] | None:
+    return None if data[key] is None else _section(field, data, key, known)
+
+
+def _check_keys(field: str, data: object, known: set[str], needed: set[str]) -> None:
+    if not isinstance(data, Mapping):
+        raise InputError(field, type(data).__name__, f"a mapping with the keys {', '.join(sorted(known))}")
+    for key in data:
+        if key not in known:
+            raise UnknownNameError(field, str(key), sorted(known))
+    for key in sorted(needed - set(data)):
+        raise InputError(f"{field}.{key}", "nothing", "a value")
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and tuples as lists, everything else as it is."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(v) for v in value]
+    return float(value) if isinstance(value, np.floating) else value

@@ -1,0 +1,56 @@
+"""What is new at each visit and the same for all targets seen there.
+
+A joint does not come back to exactly where it was: at visit i the joints err by h_i ~ N(0, σ_j² I), and the
+targets move by c(q_i) h_i. What else the targets of one visit share (the tracker's frame as it is that moment,
+warmth of the arm, a base that gives way) is a common shift s_i ~ N(0, σ_c² I). Together they are, with c the
+levers of the visit and 1 the column that repeats the three axes for every target,
+
+    cov = σ_j² c cᵀ + σ_c² (1 1ᵀ ⊗ I_3) .
+
+Visits are independent of each other. With a single target s_i cannot be told from the floor of the point, which
+then stands for both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray
+from calib_planner.error_model.poses import Poses
+
+
+@dataclass(frozen=True)
+class Visits:
+    """Errors of a visit.
+
+    Attributes:
+        joints: Whether the joints' repeatability is in the model.
+        shared: Whether the common shift is.
+    """
+
+    joints: bool = True
+    shared: bool = True
+
+    name: ClassVar[str] = "visits"
+    title: ClassVar[str] = "repeatability, and what the targets of a visit share"
+
+    @property
+    def scales(self) -> tuple[str, ...]:
+        """Names of the standard deviations of the error model that this term uses."""
+        wanted = (("repeatability", self.joints), ("shared", self.shared))
+        return tuple(name for name, there in wanted if there)
+
+    def parts(self, poses: Poses, values: dict[str, float]) -> dict[str, FloatArray]:
+        """Scale → (N, 3·targets, 3·targets) its part of the covariance of a visit [m²]."""
+        result: dict[str, FloatArray] = {}
+        count = len(poses.robot.targets)
+        if self.joints:
+            columns = poses.levers * values["repeatability"]
+            result["repeatability"] = columns @ columns.transpose(0, 2, 1)
+        if self.shared and count > 1:
+            block = values["shared"] ** 2 * np.kron(np.ones((count, count)), np.eye(3))
+            result["shared"] = np.broadcast_to(block, (len(poses), 3 * count, 3 * count))
+        return result

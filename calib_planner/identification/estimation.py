@@ -1,0 +1,399 @@
+"""Identification with one error model: from measurements to parameters, coefficients and scales.
+
+    1. start      Base and targets, where they are unknown, in closed form (``registration``), then generalised
+                  least squares at typical scales until the predictions stand still.
+    2. scales     Linearise at the current values, (M1); the scales maximise the restricted likelihood times their
+                  priors (``likelihood``); generalised least squares gives parameters and coefficients. Repeat.
+    3. doubt      Where points or a run of visits are impossible beside the others, these lose their weight
+                  (``doubt``).
+    4. terms      A term that does not better the left-out score goes (``left_out``).
+    5. all        Many points: 1 to 4 are done with some of the visits; generalised least squares at the scales
+                  found is done with all of them.
+
+The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray
+from calib_planner.error_model.knowledge import Knowledge
+from calib_planner.error_model.model import ErrorModel
+from calib_planner.error_model.poses import Poses
+from calib_planner.errors import NotEnoughDataError
+from calib_planner.identification.doubt import (
+    LARGEST,
+    OUT,
+    impossible,
+    many_are_wrong,
+    part_of,
+    shifted_run,
+    student,
+)
+from calib_planner.identification.left_out import LeftOut, left_out
+from calib_planner.identification.likelihood import (
+    LinearProblem,
+    Solution,
+    maximise,
+    scale_covariance,
+    solve,
+    with_uncertain_scales,
+)
+from calib_planner.identification.measurements import Measurements
+from calib_planner.identification.registration import place, tip_poses
+from calib_planner.identification.term_worth import TermWorth, term_worths
+from calib_planner.instrument.noise import Isotropic
+from calib_planner.robot.chain import Robot
+
+MOST_STARTS = 20
+"""Most relinearisations at typical scales."""
+MOST_ROUNDS = 6
+"""Most relinearisations with new scales."""
+STUDENT_ROUNDS = 12
+"""Most rounds of Student weights."""
+CAUCHY_ROUNDS = 30
+"""Most rounds of weights that place tracker and targets."""
+FAR = 30.0
+"""Points this many medians away are doubted from the start."""
+BENT = 1e-3
+"""Predictions that move by more than this are looked at before the step is taken [m]."""
+MOST_DOUBTS = 8
+"""Most rounds in which impossible points come and go."""
+MATERIAL = 3.0
+"""A run that is shifted by fewer standard deviations of a point is left alone."""
+LEAST = 1e-8
+"""Predictions that move by less than this stand still [m]."""
+STILL = 1e-3
+"""Predictions that move by less than this share of a point's standard deviation stand still."""
+ENOUGH = 450
+"""Coordinates from which scales and terms are decided; more visits than that do not take part."""
+OPTIONAL = ("short", "smooth", "gravity")
+"""Terms that have to better the left-out score."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelEstimate:
+    """What the measurements say.
+
+    Attributes:
+        knowledge: Robot, model with the scales found, coefficients and their covariance; it predicts.
+        left_out: (M4) of every visit.
+        doubt: (N, targets) variance of each point beside the model's [m²]; 0 where it counts in full.
+        terms: Every term of the model asked for, with its size and gain.
+        solution: The last linear problem and its solution.
+        rounds: Relinearisations made.
+        converged: Whether the predictions stood still at the end.
+    """
+
+    knowledge: Knowledge
+    left_out: LeftOut
+    doubt: FloatArray
+    terms: tuple[TermWorth, ...]
+    solution: Solution
+    rounds: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where it is linearised: β (coefficients,), the model's scales, D of every point (N, targets)."""
+
+    coefficients: FloatArray
+    model: ErrorModel
+    doubt: FloatArray
+
+
+class _Work:
+    """The measurements, and a state that goes from one relinearisation to the next.
+
+    Attributes:
+        robot: With base and targets about where they are; β are deviations from it.
+        data: The visits that take part.
+        load: (N,) payload of each visit as a share of the largest one, or ``None``.
+        state: Where it is linearised.
+        rounds: Relinearisations made.
+        converged: Whether the predictions stood still in the last one.
+        shifted: (N, targets) D of the points of a run of visits that is shifted [m²]; 0 for all others.
+    """
+
+    def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
+        self.robot, self.data, self.load = robot, data, load
+        self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
+        self.rounds, self.converged = 0, False
+        self.shifted = np.zeros(data.seen.shape)
+
+    def linearised(self) -> LinearProblem:
+        """(M1) at the state."""
+        data, state = self.data, self.state
+        poses = self._poses(state.coefficients)
+        seen = np.repeat(data.seen, 3, axis=1).astype(float)
+        columns = state.model.columns(poses) * seen[:, :, None]
+        apart = np.where(data.seen[:, :, None], data.p - poses.points, 0.0).reshape(seen.shape)
+        random = np.isfinite(state.model.variances(self.robot))
+        stated = None
+        if data.std is not None and state.model.points.noise is None:
+            std = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0)
+            stated = std[..., None] ** 2 * np.eye(3)
+        parts = state.model.visit_parts(poses, stated)
+        if state.doubt.any():
+            parts = parts | {"doubt": part_of(state.doubt)}
+        both = seen[:, :, None] * seen[:, None, :]
+        parts = {n: p * both for n, p in parts.items()}
+        y = apart + columns[:, :, random] @ state.coefficients[random]
+        return LinearProblem(self.robot, state.model, y, columns, parts, seen)
+
+    def accept(self, solution: Solution) -> bool:
+        """Go to the solution; whether the predictions stood still."""
+        problem, old = solution.problem, self.state.coefficients
+        new = solution.coefficients.copy()
+        new[problem.flat] += old[problem.flat]
+        step = new - old
+        change = np.abs(problem.columns @ step)
+        shares = (1.0, 0.5, 0.25, 0.1, 0.03) if change.max() > BENT else (1.0,)
+        if len(shares) > 1:
+            cost = self._cost(problem, old)
+            step = next(
+                (share * step for share in shares if self._cost(problem, old + share * step) <= cost), 0.0 * step
+            )
+        std = np.sqrt(np.diagonal(problem.covariance, axis1=1, axis2=2))
+        self.state = replace(self.state, coefficients=old + step, model=problem.model)
+        self.rounds += 1
+        self.converged = bool((change <= STILL * std + LEAST).all())
+        return self.converged or not step.any()
+
+    def _cost(self, problem: LinearProblem, coefficients: FloatArray) -> float:
+        """What least squares minimises, through the kinematics and not its linearisation."""
+        apart = np.where(self.data.seen[:, :, None], self.data.p - self._poses(coefficients).points, 0.0)
+        flat = apart.reshape(len(apart), -1, 1)
+        prior = np.sum((coefficients[problem.random] / problem.root) ** 2, where=problem.root > 0.0)
+        return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
+
+    def _poses(self, coefficients: FloatArray) -> Poses:
+        """Parameters and deflected joints at β (coefficients,)."""
+        names = self.robot.parameter_names
+        here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
+        poses = Poses(here, self.data.q, self.load)
+        return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
+
+    def settle(self, most: int, scales: int = 30) -> Solution:
+        """Relinearise until the predictions stand still; ``scales``: rounds for the scales each time."""
+        for _ in range(most):
+            problem = self.linearised()
+            solution = maximise(problem, scales) if scales else solve(problem)
+            if self.accept(solution):
+                break
+        return solution
+
+    def doubt(self, solution: Solution) -> Solution:
+        """Take the weight of what is impossible, and fit again."""
+        solution = self._without_run(solution)
+        if many_are_wrong(solution, self.state.doubt):
+            for _ in range(STUDENT_ROUNDS):
+                old = self.state.doubt
+                new = np.maximum(student(solution, old), self.shifted)
+                self.state = replace(self.state, doubt=new)
+                solution = self.settle(1, 3)
+                own = np.trace(solution.problem.covariance, axis1=1, axis2=2).min() / new.shape[1]
+                if np.abs(np.log((new + own) / (old + own))).max() < 0.1:
+                    break
+        return self.reconsider(solution, MOST_DOUBTS, 30)
+
+    def reconsider(self, solution: Solution, rounds: int, scales: int) -> Solution:
+        """Only what is impossible stays doubted; fit again as long as that changes."""
+        for _ in range(rounds):
+            old = self.state.doubt
+            new = np.maximum(impossible(solution, old), self.shifted)
+            if ((new > 0) == (old > 0)).all() and (new <= 2.0 * old).all():
+                break
+            self.state = replace(self.state, doubt=new)
+            solution = self.settle(2, scales)
+        return solution
+
+    def _without_run(self, solution: Solution) -> Solution:
+        """Without the run of visits that is shifted, if there is one and it matters; its D is ``shifted``."""
+        run, before = shifted_run(solution), (self.state, self.rounds, self.converged)
+        if run is None:
+            return solution
+        far = OUT * len(run) * float(np.sum(left_out(solution).residuals ** 2, axis=2).max())
+        own = float(np.median(np.diagonal(solution.problem.covariance, axis1=1, axis2=2)))
+        doubt = np.zeros(self.data.seen.shape)
+        doubt[run] = np.where(self.data.seen[run], min(far, LARGEST * own), 0.0)
+        self.state = replace(self.state, doubt=np.maximum(doubt, self.state.doubt))
+        without = self.settle(MOST_ROUNDS)
+        shift = left_out(without).residuals[run][self.data.seen[run]].mean(axis=0)
+        rest = without.problem.covariance[np.setdiff1d(np.arange(len(doubt)), run)]
+        std = np.sqrt(np.median(np.trace(rest, axis1=1, axis2=2)) / doubt.shape[1])
+        if np.linalg.norm(shift) > MATERIAL * std:
+            self.shifted = doubt
+            return without
+        self.state, self.rounds, self.converged = before
+        return solution
+
+    def choose_terms(self, solution: Solution) -> tuple[Solution, dict[str, float]]:
+        """Without the terms that do not better the left-out score; term → gain."""
+        gains: dict[str, float] = {}
+        while True:
+            score = left_out(solution).score
+            trials = {t: maximise(_without(solution.problem, t), 6) for t in _optional(solution.problem.model)}
+            found = {t: score - left_out(trial).score for t, trial in trials.items()}
+            gains |= found
+            if not found or min(found.values()) > 0.0:
+                return solution, gains
+            worst = min(found, key=lambda t: found[t])
+            before = self.state
+            solution = trials[worst]
+            kept = _place(before.model, solution.problem.model, self.robot)
+            self.state = replace(before, coefficients=before.coefficients[kept], model=solution.problem.model)
+
+
+def estimate(
+    robot: Robot,
+    data: Measurements,
+    model: ErrorModel,
+    *,
+    load: FloatArray | None = None,
+    robust: bool = True,
+    choose: bool = True,
+) -> ModelEstimate:
+    """Identify the active parameters of ``robot`` and all else that the model has.
+
+    Args:
+        robot: Nominal. Base and targets start in closed form if all their parameters are active.
+        data: The measurements; the joint order may differ from the robot's.
+        model: The terms, with their scales before the data.
+        load: (N,) payload of each visit as a share of the largest one, or ``None``.
+        robust: Whether impossible points lose weight; never with the paper's model.
+        choose: Whether terms that do not better the left-out score go.
+
+    Raises:
+        NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
+    """
+    data = data.in_order_of(robot.joint_names)
+    robust, choose = robust and not model.is_papers, choose and not model.is_papers
+    try:
+        return _estimate(robot, data, model, load, robust, choose)
+    except np.linalg.LinAlgError:
+        need = len(robot.parameter_names)
+        message = "the measured configurations do not determine the robot's place: measure more that differ"
+        raise NotEnoughDataError(3 * int(data.seen.sum()), need, message) from None
+
+
+def _estimate(
+    robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None, robust: bool, choose: bool
+) -> ModelEstimate:
+    """The same for clean arguments."""
+    robot, far = _placed(robot, data)
+    some = _some(data)
+    part = data if some is None else data.select(some)
+    work = _Work(robot, part, model, load if load is None or some is None else load[some])
+    if robust:
+        work.state = replace(work.state, doubt=far if some is None else far[some])
+    work.settle(MOST_STARTS, 0)
+    solution = work.settle(MOST_ROUNDS)
+    if robust:
+        solution = work.doubt(solution)
+    gains: dict[str, float] = {}
+    if choose:
+        solution, gains = work.choose_terms(solution)
+        solution = work.settle(2)
+    if work.state.model.scales:
+        solution = work.settle(MOST_ROUNDS, 0)
+    scales = scale_covariance(solution)
+    if some is not None:
+        whole = _Work(robot, data, work.state.model, load)
+        near = np.clip(np.searchsorted(some, np.arange(len(data))), 0, len(some) - 1)
+        whole.shifted = np.where(data.seen, work.shifted[near].max(axis=1)[:, None], 0.0)
+        doubt = np.maximum(far, whole.shifted) if robust else np.zeros(data.seen.shape)
+        doubt[some] = work.state.doubt
+        whole.state, whole.rounds = replace(work.state, doubt=doubt), work.rounds
+        solution = whole.settle(2, 0)
+        if robust:
+            solution = whole.reconsider(solution, 2, 0)
+        work = whole
+    hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
+    told = work.state.model
+    if data.std is not None and told.points.noise is None:
+        # What was said of these points is what is expected of others.
+        usual = Isotropic(float(np.sqrt(np.mean(np.asarray(data.std)[data.seen] ** 2))))
+        told = replace(told, points=replace(told.points, noise=usual))
+    known = Knowledge(robot, told, work.state.coefficients, covariance, hidden)
+    return ModelEstimate(
+        knowledge=known,
+        left_out=left_out(solution),
+        doubt=work.state.doubt,
+        terms=term_worths(model, solution.problem, work.state.coefficients, gains),
+        solution=solution,
+        rounds=work.rounds,
+        converged=work.converged,
+    )
+
+
+def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
+    """``robot`` with unknown base and targets where they fit the nominal chain best, and D of far points.
+
+    Each point weighs by how far it is from where the others put it (Cauchy, with the median as scale): some that
+    are wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the
+    start.
+    """
+    active = robot.parameter_names
+    base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
+    tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
+    weights, seen = data.seen.astype(float), data.seen
+    poses = tip_poses(robot, data.q, at_base=base) if base or tool else None
+    for _ in range(CAUCHY_ROUNDS if poses else 1):
+        if poses:
+            put = place(robot, data, poses, base=base, tool=tool, weights=weights).of(robot, base=base, tool=tool)
+        else:
+            put = robot
+        length = np.linalg.norm(np.where(seen[:, :, None], data.p - put.positions(data.q), 0.0), axis=2)
+        median = max(float(np.median(length[seen])), LEAST)
+        new = np.where(seen, 1.0 / (1.0 + (length / median) ** 2), 0.0)
+        settled, weights = np.abs(new - weights).max() < 0.01, new
+        if settled:
+            break
+    return put, np.where(length > FAR * median, OUT * length**2, 0.0)
+
+
+def _some(data: Measurements) -> FloatArray | None:
+    """Numbers of the visits that decide scales and terms, in their order; ``None``: all."""
+    size = 3 * data.seen.sum(axis=1)
+    if size.sum() <= ENOUGH:
+        return None
+    order = np.random.default_rng(0).permutation(len(size))
+    return np.sort(order[np.cumsum(size[order]) <= ENOUGH])
+
+
+def _optional(model: ErrorModel) -> tuple[str, ...]:
+    """Terms of this model that have to better the left-out score."""
+    components = () if model.joint_functions is None else model.joint_functions.components
+    there = (*components, *(("gravity",) if model.gravity is not None else ()))
+    return tuple(t for t in OPTIONAL if t in there)
+
+
+def _place(model: ErrorModel, smaller: ErrorModel, robot: Robot) -> FloatArray:
+    """Where the coefficients of ``smaller`` are among those of ``model``."""
+    at = {name: i for i, name in enumerate(model.names(robot))}
+    return np.array([at[name] for name in smaller.names(robot)], int)
+
+
+def _without(problem: LinearProblem, term: str) -> LinearProblem:
+    """The same linear problem without a term."""
+    model = problem.model.without(term)
+    columns = problem.columns[:, :, _place(problem.model, model, problem.robot)]
+    return replace(problem, model=model, columns=columns)
+
+
+def _hidden(problem: LinearProblem) -> FloatArray:
+    """(coefficients, directions) of flat coefficients that no point shows."""
+    rows = problem.columns[:, :, problem.flat].reshape(problem.y.size, -1)
+    rank = problem.basis.shape[1]
+    result = np.zeros((problem.columns.shape[2], rows.shape[1] - rank))
+    if result.shape[1]:
+        length = np.linalg.norm(rows, axis=0)
+        length[length == 0.0] = 1.0
+        vectors = np.linalg.svd(np.linalg.qr(rows / length, mode="r"))[2]
+        result[problem.flat] = vectors[rank:].T / length[:, None]
+    return result

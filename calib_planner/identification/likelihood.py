@@ -1,0 +1,433 @@
+"""The linear problem of one relinearisation: generalised least squares and the restricted likelihood.
+
+With the flat columns F (base, targets, and placement where its prior is flat), all other columns B with
+coefficients u ~ N(0, Λ), and V = blockdiag(R_i) + B Λ Bᵀ, the measured minus the predicted coordinates are
+
+    y = F γ + B u + e ,      y ~ N(F γ, V),
+
+    P = V⁻¹ − V⁻¹F S⁻¹ FᵀV⁻¹ ,   S = FᵀV⁻¹F ,   γ̂ = S⁻¹FᵀV⁻¹y ,   û = Λ Bᵀ P y ,                            (1)
+    −2 log L = log|V| + log|S| + yᵀ P y      (Patterson & Thompson 1971, without its constants).               (2)
+
+Its derivative by a scale θ is tr(P ∂V) − (Py)ᵀ ∂V (Py). R has blocks and Λ is diagonal, so that three things tell
+all derivatives: the blocks P_ii, the vector Py, and for every column b_k both b_kᵀ P b_k and b_kᵀ P y.
+
+Two forms give them. The *dense* one factorises V, of the size of the measured coordinates. The one *by
+coefficients* factorises, with W = [F, B Λ^½] and D = diag(0, 1) (Woodbury),
+
+    A = Wᵀ R⁻¹ W + D ,   P = R⁻¹ − R⁻¹ W A⁻¹ Wᵀ R⁻¹ ,   log|V| + log|S| = log|R| + log|A|,                     (3)
+
+of the size of the coefficients: for thousands of points. Columns scaled by Λ^½ keep A regular when a term
+vanishes, and R is regular because its scales have priors. Flat columns enter as an orthonormal basis of what they
+span, so that redundant ones do no harm: β_flat = Z γ with the shortest solution. Coordinates that were not
+measured are rows of zeros with variance one; they change nothing.
+
+The scales are the maximum of L times their log-normal priors (``maximise``), by Newton steps with the average
+information f_aᵀ P f_b, f_a = ∂_a V P y (Gilmour, Thompson & Cullis 1995), in the logarithms of the scales.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.lapack import dpotri
+
+from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.error_model.model import ErrorModel
+from calib_planner.robot.chain import Robot
+
+RANK = 1e-7
+"""Singular values of the flat columns, of unit length, below this share of the largest count as zero."""
+LONGEST_STEP = 1.5
+"""Most that the logarithm of a scale changes in one step."""
+SMALLEST, LARGEST = 5e-3, 300.0
+"""Shares of its median between which a scale stays: smaller is none, and larger ones are gross errors' doing."""
+UNBOUNDED = 1e9
+"""The same where nothing is known of a scale; a factor from which on this is so."""
+SETTLED = 0.02
+"""A step that promises less than this of −2 log L ends the search."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearProblem:
+    """One relinearisation.
+
+    Attributes:
+        robot: At which it was linearised.
+        model: Its scales are those of ``parts``.
+        y: (N, m) measured − predicted + B u₀ [m], zero where not measured.
+        columns: (N, m, coefficients) J⁺, zero rows where not measured.
+        parts: Scale → (N, m, m) its part of R_i, zero rows and columns where not measured [m²].
+        seen: (N, m) 1 where measured.
+    """
+
+    robot: Robot
+    model: ErrorModel
+    y: FloatArray
+    columns: FloatArray
+    parts: Mapping[str, FloatArray]
+    seen: FloatArray
+
+    @cached_property
+    def flat(self) -> IntArray:
+        """Numbers of the coefficients without a prior."""
+        return np.flatnonzero(np.isinf(self.model.variances(self.robot)))
+
+    @cached_property
+    def random(self) -> IntArray:
+        """Numbers of the coefficients with one."""
+        return np.flatnonzero(np.isfinite(self.model.variances(self.robot)))
+
+    @cached_property
+    def basis(self) -> FloatArray:
+        """Z (flat, rank): the flat coefficients are Z γ, and columns · Z are orthonormal."""
+        rows = self.columns[:, :, self.flat].reshape(self.y.size, -1)
+        if not rows.shape[1]:
+            return np.zeros((0, 0))
+        length = np.linalg.norm(rows, axis=0)
+        length[length == 0.0] = np.inf
+        triangle = np.linalg.qr(rows / length, mode="r")
+        _, values, vectors = np.linalg.svd(triangle)
+        keep = values > RANK * values[0] if len(values) and values[0] > 0 else values > 0
+        return (vectors[: len(values)][keep] / values[keep][:, None]).T / length[:, None]
+
+    @cached_property
+    def flat_columns(self) -> FloatArray:
+        """(N·m, rank) columns · Z."""
+        return self.columns[:, :, self.flat].reshape(self.y.size, -1) @ self.basis
+
+    @cached_property
+    def random_columns(self) -> FloatArray:
+        """(N·m, K) B."""
+        return np.ascontiguousarray(self.columns[:, :, self.random].reshape(self.y.size, -1))
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """(K,) Λ^½."""
+        return np.sqrt(self.model.variances(self.robot)[self.random])
+
+    @cached_property
+    def scaled_columns(self) -> FloatArray:
+        """(N·m, K) B Λ^½."""
+        return self.random_columns * self.root
+
+    @cached_property
+    def ratios(self) -> dict[str, FloatArray]:
+        """Scale that the data decide → (K,) ∂ log λ_k by its logarithm."""
+        slopes = {name: slope[self.random] for name, slope in self.model.slopes(self.robot).items()}
+        there = self.root > 1e-145
+        return {n: np.where(there, s, 0.0) / np.where(there, self.root**2, 1.0) for n, s in slopes.items()}
+
+    def expand(self, reduced: FloatArray) -> FloatArray:
+        """β (coefficients, …) of γ and Λ^-½ u (rank + K, …)."""
+        rank = self.basis.shape[1]
+        result = np.zeros((self.columns.shape[2], *reduced.shape[1:]))
+        result[self.flat] = self.basis @ reduced[:rank]
+        result[self.random] = (self.root * reduced[rank:].T).T
+        return result
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """(N, m, m) R_i."""
+        identity = np.eye(self.y.shape[1])
+        return np.sum(list(self.parts.values()), axis=0) + (1.0 - self.seen)[:, :, None] * identity
+
+    def at(self, model: ErrorModel) -> LinearProblem:
+        """The same with other values of the scales."""
+        new, old = model.values, self.model.values
+        parts = {n: p * (new[n] / old[n]) ** 2 if n in new else p for n, p in self.parts.items()}
+        result = replace(self, model=model, parts=parts)
+        for name in ("flat", "random", "basis", "flat_columns", "random_columns"):
+            result.__dict__[name] = getattr(self, name)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Generalised least squares at given scales.
+
+    Attributes:
+        problem: What was solved.
+        value: −2 log L of (2) or (3), constants left out.
+        coefficients: (coefficients,) γ̂ as Z γ̂, and û; flat ones are changes from where it was linearised.
+        weighted: (N, m) P y [1/m].
+        blocks: (N, m, m) P_ii [1/m²].
+        squares: (K,) λ_k b_kᵀ P b_k.
+        pulls: (K,) λ_k^½ b_kᵀ P y.
+    """
+
+    problem: LinearProblem
+    value: float
+    coefficients: FloatArray
+    weighted: FloatArray
+    blocks: FloatArray
+    squares: FloatArray
+    pulls: FloatArray
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        """P · vectors, (N·m, n) → (N·m, n)."""
+        raise NotImplementedError
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        """γ̂ and Λ^-½ û if ``vectors`` (N·m, n) had been measured: (rank + K, n)."""
+        raise NotImplementedError
+
+    def _reduced_covariance(self) -> FloatArray:
+        """(rank + K, rank + K) of γ and Λ^-½ u."""
+        raise NotImplementedError
+
+    def coefficients_of(self, vectors: FloatArray) -> FloatArray:
+        """β if ``vectors`` (N·m, n) had been measured: (coefficients, n)."""
+        return self.problem.expand(self._reduced(vectors))
+
+    def posterior(self) -> FloatArray:
+        """(coefficients, coefficients) C of β given the data, (M2); zero in directions no point shows."""
+        half = self.problem.expand(self._reduced_covariance())
+        return self.problem.expand(half.T)
+
+
+@dataclass(frozen=True, eq=False)
+class DenseSolution(Solution):
+    """By (1): ``projection`` P, ``spread`` S⁻¹ and ``carried`` V⁻¹F."""
+
+    projection: FloatArray
+    spread: FloatArray
+    carried: FloatArray
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        return self.projection @ vectors
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        flat = self.spread @ (self.carried.T @ vectors)
+        return np.vstack([flat, self.problem.scaled_columns.T @ (self.projection @ vectors)])
+
+    def _reduced_covariance(self) -> FloatArray:
+        scaled = self.problem.scaled_columns
+        cross = -self.spread @ (self.carried.T @ scaled)
+        own = np.eye(scaled.shape[1]) - scaled.T @ self.projection @ scaled
+        return np.block([[self.spread, cross], [cross.T, own]])
+
+
+@dataclass(frozen=True, eq=False)
+class CoefficientSolution(Solution):
+    """By (3).
+
+    ``inverse`` (N, m, m) holds L⁻¹ of R_i = L Lᵀ, ``white`` (N·m, rank + K) is L⁻¹W, and half halfᵀ = A⁻¹.
+    """
+
+    inverse: FloatArray
+    white: FloatArray
+    half: FloatArray
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        turned = self._times(self.inverse, vectors)
+        turned = turned - self.white @ (self.half @ (self.half.T @ (self.white.T @ turned)))
+        return self._times(self.inverse.transpose(0, 2, 1), turned)
+
+    def _times(self, blocks: FloatArray, vectors: FloatArray) -> FloatArray:
+        n, m = self.problem.y.shape
+        return np.asarray((blocks @ vectors.reshape(n, m, -1)).reshape(n * m, -1))
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        turned = self._times(self.inverse, vectors)
+        return np.asarray(self.half @ (self.half.T @ (self.white.T @ turned)))
+
+    def _reduced_covariance(self) -> FloatArray:
+        return np.asarray(self.half @ self.half.T)
+
+
+def solve(problem: LinearProblem) -> Solution:
+    """The cheaper of both forms."""
+    coordinates, coefficients = problem.y.size, problem.columns.shape[2]
+    return dense(problem) if coordinates <= coefficients else by_coefficients(problem)
+
+
+def dense(problem: LinearProblem) -> DenseSolution:
+    """By factorising V, (1)."""
+    n, m = problem.y.shape
+    y, flat, scaled = problem.y.ravel(), problem.flat_columns, problem.scaled_columns
+    every = np.arange(n)
+    total = scaled @ scaled.T
+    total.reshape(n, m, n, m)[every, :, every, :] += problem.covariance
+    factor = np.linalg.cholesky(total)
+    half, _ = dpotri(factor, lower=1)
+    inverse = np.tril(half) + np.tril(half, -1).T
+    carried = inverse @ flat
+    normal = flat.T @ carried
+    spread = _inverse(normal)
+    projection = inverse - carried @ spread @ carried.T
+    pulled = projection @ y
+    value = 2.0 * np.log(np.diag(factor)).sum() + np.linalg.slogdet(normal)[1] + y @ pulled
+    pulls = scaled.T @ pulled
+    return DenseSolution(
+        problem,
+        float(value),
+        problem.expand(np.append(spread @ (carried.T @ y), pulls)),
+        pulled.reshape(n, m),
+        projection.reshape(n, m, n, m)[every, :, every, :],
+        np.einsum("ak,ak->k", scaled, projection @ scaled),
+        pulls,
+        projection,
+        spread,
+        carried,
+    )
+
+
+def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
+    """By factorising A, (3)."""
+    n, m = problem.y.shape
+    rank = problem.flat_columns.shape[1]
+    lower = np.linalg.cholesky(problem.covariance)
+    inverse = np.linalg.inv(lower)
+    columns = np.hstack([problem.flat_columns, problem.scaled_columns])
+    white = (inverse @ columns.reshape(n, m, -1)).reshape(n * m, -1)
+    right = (inverse @ problem.y[:, :, None]).ravel()
+    normal = white.T @ white
+    normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    factor = np.linalg.cholesky(normal * np.outer(scale, scale))
+    half = scale[:, None] * np.linalg.inv(factor).T
+    solution = half @ (half.T @ (white.T @ right))
+    rest = right - white @ solution
+    value = 2.0 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum()
+    value += 2.0 * (np.log(np.diag(factor)) - np.log(scale)).sum() + right @ rest
+    share = (white @ half).reshape(n, m, -1)
+    transposed = inverse.transpose(0, 2, 1)
+    return CoefficientSolution(
+        problem,
+        float(value),
+        problem.expand(solution),
+        (transposed @ rest.reshape(n, m, 1))[:, :, 0],
+        transposed @ (np.eye(m) - share @ share.transpose(0, 2, 1)) @ inverse,
+        1.0 - np.sum(half[rank:] ** 2, axis=1),
+        solution[rank:],
+        inverse,
+        white,
+        half,
+    )
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Of a positive definite matrix, scaled to unit diagonal first."""
+    if not len(matrix):
+        return matrix
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    half = np.linalg.inv(np.linalg.cholesky(matrix * np.outer(scale, scale))) * scale
+    return np.asarray(half.T @ half)
+
+
+# ── the scales ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def unknown_scales(model: ErrorModel, parts: Mapping[str, FloatArray], robot: Robot) -> tuple[str, ...]:
+    """Scales that the data decide: not known, and with a part or a column here."""
+    slopes = model.slopes(robot)
+    return tuple(s.name for s in model.scales if not s.known and (s.name in parts or s.name in slopes))
+
+
+def penalty(model: ErrorModel, names: tuple[str, ...]) -> tuple[float, FloatArray, FloatArray]:
+    """−2 log of the scales' log-normal priors, its gradient by their logarithms and its curvature."""
+    chosen = {s.name: s for s in model.scales}
+    apart = np.array([np.log(chosen[n].value / chosen[n].median) for n in names])
+    weight = np.array([1.0 / np.log(chosen[n].factor) ** 2 for n in names])
+    return float(apart @ (weight * apart)), 2.0 * weight * apart, 2.0 * weight
+
+
+def derivatives(solution: Solution, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+    """Gradient of −2 log L by the logarithms of the scales, and its average information (scales, scales)."""
+    problem = solution.problem
+    gradient, pushes = np.zeros(len(names)), np.zeros((problem.y.size, len(names)))
+    for at, name in enumerate(names):
+        if name in problem.parts:
+            part = 2.0 * problem.parts[name]
+            push = (part @ solution.weighted[:, :, None])[:, :, 0]
+            gradient[at] += np.sum(part * solution.blocks) - np.sum(push * solution.weighted)
+            pushes[:, at] += push.ravel()
+        ratio = problem.ratios.get(name)
+        if ratio is not None:
+            gradient[at] += ratio @ (solution.squares - solution.pulls**2)
+            pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
+    return gradient, pushes.T @ solution.project(pushes)
+
+
+def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], FloatArray]) -> FloatArray:
+    """C of β, with what the uncertainty of the scales adds (Kackar & Harville 1984): C + D cov(log θ) Dᵀ.
+
+    D = ∂β̂/∂log θ: of γ̂ and û = Λ Bᵀ P y, with ∂P = −P ∂V P, it is −β̂(∂V P y), β̂(·) being the estimate from
+    other measurements, plus ∂Λ Bᵀ P y.
+
+    Args:
+        solution: At the scales found.
+        scales: Their names, and cov(log θ) as ``scale_covariance`` has it.
+    """
+    problem, (names, covariance) = solution.problem, scales
+    result = solution.posterior()
+    if not names:
+        return result
+    pushes, direct = np.zeros((problem.y.size, len(names))), np.zeros((len(result), len(names)))
+    for at, name in enumerate(names):
+        if name in problem.parts:
+            pushes[:, at] += 2.0 * (problem.parts[name] @ solution.weighted[:, :, None]).ravel()
+        ratio = problem.ratios.get(name)
+        if ratio is not None:
+            pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
+            direct[problem.random, at] = ratio * solution.coefficients[problem.random]
+    slope = direct - solution.coefficients_of(pushes)
+    return np.asarray(result + slope @ covariance @ slope.T)
+
+
+def scale_covariance(solution: Solution) -> tuple[tuple[str, ...], FloatArray]:
+    """Names of the scales that the data decide, and the covariance of their logarithms."""
+    problem = solution.problem
+    names = unknown_scales(problem.model, problem.parts, problem.robot)
+    if not names:
+        return names, np.zeros((0, 0))
+    information = derivatives(solution, names)[1] + np.diag(penalty(problem.model, names)[2])
+    return names, np.asarray(2.0 * np.linalg.inv(information))
+
+
+def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED) -> Solution:
+    """The scales of greatest restricted likelihood times their priors; the solution there.
+
+    Args:
+        problem: At the scales to begin from.
+        rounds: Most Newton steps.
+        settled: See ``SETTLED``.
+    """
+    names = unknown_scales(problem.model, problem.parts, problem.robot)
+    best = solve(problem)
+    if not names:
+        return best
+    if len(names) == 1:  # the paper's: the search to the end costs nothing
+        settled = min(settled, 1e-12)
+    prior, slope, curve = penalty(problem.model, names)
+    for _ in range(rounds):
+        gradient, information = derivatives(best, names)
+        gradient, information = gradient + slope, information + np.diag(curve)
+        step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
+        step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        if -(gradient @ step) < settled:
+            break
+        for _ in range(6):
+            model = _moved(best.problem.model, names, step)
+            trial = solve(best.problem.at(model))
+            trial_prior = penalty(model, names)
+            if trial.value + trial_prior[0] < best.value + prior:
+                break
+            step = 0.5 * step
+        else:
+            break
+        best, (prior, slope, curve) = trial, trial_prior
+    return best
+
+
+def _moved(model: ErrorModel, names: tuple[str, ...], step: FloatArray) -> ErrorModel:
+    """The scales moved by ``step`` of their logarithms, within bounds where anything is known of them."""
+    chosen, values = {s.name: s for s in model.scales}, {}
+    for name, change in zip(names, step, strict=True):
+        scale = chosen[name]
+        low, high = (SMALLEST, LARGEST) if scale.factor < UNBOUNDED else (1.0 / UNBOUNDED, UNBOUNDED)
+        values[name] = float(np.clip(scale.value * np.exp(change), low * scale.median, high * scale.median))
+    return model.with_values(values)

@@ -1,0 +1,82 @@
+"""What each term of the error model is worth: its size at the tool, and what it gains.
+
+A term with columns moves the measured points by B û; of the joint functions a component has the share of û that
+its prior variance has of the whole. Visits and points scatter the measured points by the trace of their part of
+R_i. The size is the root mean square over the measured points. The gain is the left-out log score with the term
+less that without it: a term that predicts gains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib_planner._arrays import FloatArray
+from calib_planner.error_model.joint_functions import JointFunctions
+from calib_planner.error_model.model import ErrorModel
+from calib_planner.identification.likelihood import LinearProblem
+
+
+@dataclass(frozen=True, eq=False)
+class TermWorth:
+    """What a term is worth.
+
+    Attributes:
+        name: ``placement``, ``gravity``, ``smooth``, ``short``, ``visits`` or ``points``.
+        size: Root mean square of what it moves a measured point by [m]; 0 if the term went.
+        gain: Left-out log score with it less that without; NaN where it is not asked.
+        kept: Whether it is in the model.
+    """
+
+    name: str
+    size: float
+    gain: float
+    kept: bool
+
+
+def term_worths(
+    asked: ErrorModel, problem: LinearProblem, coefficients: FloatArray, gains: Mapping[str, float]
+) -> tuple[TermWorth, ...]:
+    """Every term of the model ``asked`` for.
+
+    Args:
+        asked: The model before terms went.
+        problem: The last linear problem, with the model that is left.
+        coefficients: (coefficients,) β where it ended.
+        gains: Term → gain, of terms that had to better the left-out score.
+    """
+    squares = _squares(problem, coefficients)
+    points = max(float(problem.seen.sum()) / 3.0, 1.0)
+    names = [
+        n for term in asked.terms for n in (term.components if isinstance(term, JointFunctions) else (term.name,))
+    ]
+    nothing = float("nan")
+    return tuple(
+        TermWorth(n, float(np.sqrt(squares.get(n, 0.0) / points)), gains.get(n, nothing), n in squares)
+        for n in names
+    )
+
+
+def _squares(problem: LinearProblem, coefficients: FloatArray) -> dict[str, float]:
+    """Term of the model that is left → sum of squares of what it moves the measured points by [m²]."""
+    model, robot = problem.model, problem.robot
+    result = {}
+    for term in model.systematic:
+        place = model.slices(robot)[term.name]
+        own, columns = coefficients[place], problem.columns[:, :, place]
+        if not isinstance(term, JointFunctions):
+            result[term.name] = float(np.sum((columns @ own) ** 2))
+            continue
+        total = term.variances(robot, model.values)
+        for component in term.components:
+            alone = JointFunctions((component,), term.harmonics).variances(robot, model.values)
+            share = np.divide(alone, total, out=np.zeros(len(total)), where=total > 0.0)
+            result[component] = float(np.sum((columns @ (share * own)) ** 2))
+    for scattering in (model.visits, model.points):
+        if scattering is not None:
+            parts = ("instrument", *scattering.scales) if scattering is model.points else scattering.scales
+            traces = [np.trace(problem.parts[n], axis1=1, axis2=2).sum() for n in set(parts) & set(problem.parts)]
+            result[scattering.name] = float(np.sum(traces))
+    return result

@@ -1,0 +1,204 @@
+"""Both forms of the linear problem against brute force, and every derivative against differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import problem_of, simulated, total_covariance, unknown, ur10e
+from robots import random_configurations
+
+from calib_planner.error_model import ErrorModel, Placement, typical
+from calib_planner.identification.estimation import _Work, estimate
+from calib_planner.identification.left_out import left_out
+from calib_planner.identification.likelihood import (
+    LinearProblem,
+    Solution,
+    by_coefficients,
+    dense,
+    derivatives,
+    maximise,
+    penalty,
+    scale_covariance,
+    unknown_scales,
+    with_uncertain_scales,
+)
+
+CASES: dict[str, Callable[[], LinearProblem]] = {
+    "one target": lambda: problem_of(14, 1),
+    "two targets, some not seen": lambda: problem_of(9, 2, missing=((2, 0), (5, 1), (5, 0))),
+    "flat placement, redundant": lambda: problem_of(14, 3, "flat"),
+}
+
+
+@pytest.fixture(params=CASES)
+def problem(request: pytest.FixtureRequest) -> LinearProblem:
+    return CASES[request.param]()
+
+
+def test_both_forms_agree(problem: LinearProblem) -> None:
+    one, other = dense(problem), by_coefficients(problem)
+    assert one.value == pytest.approx(other.value, rel=1e-8)
+    rows = np.random.default_rng(0).standard_normal((problem.y.size, 3)) * problem.seen.reshape(-1, 1)
+    pairs = [
+        (one.coefficients, other.coefficients),
+        (one.weighted, other.weighted),
+        (one.blocks, other.blocks),
+        (one.squares, other.squares),
+        (one.pulls, other.pulls),
+        (one.posterior(), other.posterior()),
+        (one.project(rows), other.project(rows)),
+        (one.coefficients_of(rows), other.coefficients_of(rows)),
+    ]
+    for a, b in pairs:
+        np.testing.assert_allclose(a, b, atol=2e-6 * np.abs(a).max())
+
+
+@pytest.mark.parametrize("form", [dense, by_coefficients])
+def test_it_is_generalised_least_squares(
+    problem: LinearProblem, form: Callable[[LinearProblem], Solution]
+) -> None:
+    """Against the textbook, with V written out and the flat columns by the pseudo-inverse."""
+    solution = form(problem)
+    rows = problem.seen.ravel() > 0
+    inverse = np.linalg.inv(total_covariance(problem)[np.ix_(rows, rows)])
+    flat = problem.columns.reshape(len(rows), -1)[rows][:, problem.flat]
+    y = problem.y.ravel()[rows]
+    scale = np.linalg.norm(flat, axis=0)
+    unit = flat / np.where(scale > 0, scale, 1.0)
+    fitted = unit @ np.linalg.pinv(unit.T @ inverse @ unit, rcond=1e-11) @ unit.T @ inverse @ y
+    expected = inverse @ (y - fitted)
+    np.testing.assert_allclose(solution.weighted.ravel()[rows], expected, atol=1e-5 * np.abs(expected).max())
+    variances = problem.model.variances(problem.robot)[problem.random]
+    random = problem.random_columns[rows]
+    np.testing.assert_allclose(
+        solution.coefficients[problem.random],
+        variances * (random.T @ expected),
+        atol=1e-5 * np.sqrt(variances.max()),
+    )
+    np.testing.assert_allclose(
+        flat @ solution.coefficients[problem.flat], fitted, atol=1e-5 * np.abs(fitted).max()
+    )
+
+
+@pytest.mark.parametrize("form", [dense, by_coefficients])
+def test_the_gradient_is_the_derivative(
+    problem: LinearProblem, form: Callable[[LinearProblem], Solution]
+) -> None:
+    names = unknown_scales(problem.model, problem.parts, problem.robot)
+    gradient, _ = derivatives(form(problem), names)
+    for name, slope in zip(names, gradient, strict=True):
+        value, step = problem.model.values[name], 1e-4
+        sides = [
+            form(problem.at(problem.model.with_values({name: value * np.exp(s)}))).value for s in (step, -step)
+        ]
+        assert slope == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4, abs=1e-3)
+    _, slopes, _ = penalty(problem.model.with_values({names[0]: 1e-3}), names)
+    sides = [penalty(problem.model.with_values({names[0]: 1e-3 * np.exp(s)}), names)[0] for s in (1e-5, -1e-5)]
+    assert slopes[0] == pytest.approx((sides[0] - sides[1]) / 2e-5, rel=1e-6)
+
+
+def test_the_value_is_the_restricted_likelihood(problem: LinearProblem) -> None:
+    """Its differences between scales are those of y's contrasts, free of the flat columns."""
+    rows = problem.seen.ravel() > 0
+    flat = problem.flat_columns[rows]
+    basis = np.linalg.qr(np.hstack([flat, np.eye(len(flat))]))[0][:, flat.shape[1] :]
+    contrast = basis.T @ problem.y.ravel()[rows]
+
+    def direct(p: LinearProblem) -> float:
+        covariance = basis.T @ total_covariance(p)[np.ix_(rows, rows)] @ basis
+        return float(np.linalg.slogdet(covariance)[1] + contrast @ np.linalg.solve(covariance, contrast))
+
+    other = problem.at(problem.model.with_values({"gravity": 4e-3, "floor": 6e-5, "smooth.length": 0.7}))
+    expected = direct(other) - direct(problem)
+    assert dense(other).value - dense(problem).value == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_maximum_is_one(problem: LinearProblem) -> None:
+    best = maximise(problem, 200, 1e-9)
+    names = unknown_scales(best.problem.model, problem.parts, problem.robot)
+    gradient, _ = derivatives(best, names)
+    assert np.abs(gradient + penalty(best.problem.model, names)[1]).max() < 1e-2
+    for name in names:
+        for factor in (0.5, 2.0):
+            model = best.problem.model.with_values({name: best.problem.model.values[name] * factor})
+            moved = dense(problem.at(model)).value + penalty(model, names)[0]
+            assert moved > best.value + penalty(best.problem.model, names)[0]
+
+
+@pytest.mark.parametrize("form", [dense, by_coefficients])
+def test_what_uncertain_scales_add_is_the_slope_of_the_estimate(
+    form: Callable[[LinearProblem], Solution],
+) -> None:
+    problem = problem_of(10, 2)
+    names, covariance = scale_covariance(form(problem))
+    slopes = []
+    for name in names:
+        value, step = problem.model.values[name], 1e-4
+        sides = [
+            form(problem.at(problem.model.with_values({name: value * np.exp(s)}))).coefficients
+            for s in (step, -step)
+        ]
+        slopes.append((sides[0] - sides[1]) / (2 * step))
+    slope = np.transpose(slopes)
+    solution = form(problem)
+    added = with_uncertain_scales(solution, (names, covariance)) - solution.posterior()
+    expected = slope @ covariance @ slope.T
+    np.testing.assert_allclose(added, expected, atol=1e-3 * np.abs(expected).max())
+
+
+# ── left out ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("form", [dense, by_coefficients])
+def test_left_out_residuals_are_those_of_a_refit_without_the_visit(
+    form: Callable[[LinearProblem], Solution],
+) -> None:
+    problem = problem_of(10, 2, missing=((3, 1),))
+    found = left_out(form(problem))
+    for visit in (0, 3, 7):
+        rest = np.delete(np.arange(10), visit)
+        parts = {n: p[rest] for n, p in problem.parts.items()}
+        part = replace(
+            problem, y=problem.y[rest], columns=problem.columns[rest], parts=parts, seen=problem.seen[rest]
+        )
+        without = form(part)
+        columns = problem.columns[visit]
+        residual = (problem.y[visit] - columns @ without.coefficients).reshape(-1, 3)
+        np.testing.assert_allclose(found.residuals[visit], residual, atol=1e-4 * np.abs(residual).max())
+        covariance = columns @ without.posterior() @ columns.T + problem.covariance[visit]
+        np.testing.assert_allclose(found.covariance[visit], covariance, atol=1e-4 * np.abs(covariance).max())
+        seen = problem.seen[visit] > 0
+        flat, own = residual.ravel()[seen], covariance[np.ix_(seen, seen)]
+        square = flat @ np.linalg.solve(own, flat)
+        assert found.squares[visit] == pytest.approx(square, rel=1e-4)
+        score = -0.5 * (square + np.linalg.slogdet(2.0 * np.pi * own)[1])
+        assert found.scores[visit] == pytest.approx(score, rel=1e-6)
+
+
+def test_a_visit_that_alone_tells_a_direction_has_no_left_out_residual() -> None:
+    robot = ur10e(1)
+    q = np.tile(random_configurations(robot, 1), (6, 1)) / 3.0
+    q[3:, 0] += 0.2
+    q[5, 4] += 0.5  # the one visit that shows the fifth joint
+    data, _ = simulated(robot, {}, 6, 0)
+    points = robot.positions(q)
+    model = replace(ErrorModel.paper(3e-5), placement=Placement("flat"))
+    some = robot.with_parameters("wrist_2_joint.rz,shoulder_pan_joint.rz")
+    work = _Work(some, type(data)(robot.joint_names, q, points), model, None)
+    found = left_out(dense(work.linearised()))
+    assert np.isfinite(found.scores).all() and found.usable[:5].all()
+
+
+def test_thousands_of_points_are_the_same_problem() -> None:
+    """The estimate from many visits (by coefficients) is the dense one of the same linear problem."""
+    robot = ur10e(2)
+    data, _ = simulated(robot, {"gravity": 2e-3}, 120, 1)
+    found = estimate(unknown(robot), data, typical())
+    other = dense(found.solution.problem)
+    np.testing.assert_allclose(
+        other.coefficients, found.solution.coefficients, atol=1e-6 * np.abs(other.coefficients).max()
+    )
+    assert found.converged and not found.doubt.any()

@@ -1,0 +1,74 @@
+"""The saved form gives the same model back, and refuses what it does not know."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from calib_planner.error_model import ErrorModel, Gravity, Mass, Placement, typical
+from calib_planner.error_model.saved import from_mapping, to_mapping
+from calib_planner.errors import InputError
+from calib_planner.instrument.noise import Isotropic, LaserTracker
+
+MODELS = {
+    "typical": lambda: typical(),
+    "paper": lambda: ErrorModel.paper(3e-5),
+    "masses": lambda: typical(
+        Isotropic(1e-5),
+        gravity=Gravity((Mass("arm", 2, (0.1, 0.0, 0.2), 0.5), Mass("payload")), (0.0, 1.0, 0.0)),
+        placement=Placement(stated=(("d1", 1e-4),)),
+        estimate_scale=True,
+    ),
+    "without": lambda: typical().without("short").without("gravity").with_values({"floor": 1.5e-5}, "estimated"),
+}
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+def test_yaml_and_pickle_give_it_back(make: Callable[[], ErrorModel]) -> None:
+    model = make()
+    assert from_mapping(yaml.safe_load(yaml.safe_dump(to_mapping(model)))) == model
+    assert pickle.loads(pickle.dumps(model)) == model
+
+
+def test_a_tracker_comes_back_with_its_station() -> None:
+    model = typical(LaserTracker(station=np.array([1.0, 2.0, 3.0])))
+    back = from_mapping(yaml.safe_load(yaml.safe_dump(to_mapping(model))))
+    np.testing.assert_array_equal(back.points.noise.station, [1.0, 2.0, 3.0])  # type: ignore[union-attr]
+
+
+def spoil(data: dict[str, Any], path: str, value: object) -> None:
+    *outer, last = path.split("/")
+    for key in outer:
+        data = data[key]
+    if value is None:
+        del data[last]
+    else:
+        data[last] = value
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        ("gravitas", 1, "gravitas"),
+        ("points", None, "points"),
+        ("points/floor", None, "points.floor"),
+        ("points/noise", {"kind": "sonar"}, "sonar"),
+        ("gravity/masses", [{"name": "a", "kg": 3}], "kg"),
+        ("joint_functions/components", ["rough"], "rough"),
+        ("scales/floor/value", -1.0, "floor"),
+        ("scales/floor", 3.0, "error_model"),
+        ("scales", 3.0, "error_model"),
+        ("placement", "flat", "placement"),
+        ("gravity/mounting", 7, "error_model"),
+    ],
+)
+def test_what_is_wrong_is_named(path: str, value: object, named: str) -> None:
+    data = to_mapping(typical())
+    spoil(data, path, value)
+    with pytest.raises(InputError, match=named):
+        from_mapping(data)

@@ -1,0 +1,241 @@
+"""Each term's columns, prior and slopes against an oracle of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import mixed, random_configurations
+from scipy.integrate import quad
+
+from calib_planner import Robot
+from calib_planner.error_model import (
+    ErrorModel,
+    Gravity,
+    JointFunctions,
+    Mass,
+    Placement,
+    Points,
+    Poses,
+    Visits,
+    typical,
+)
+from calib_planner.error_model.gravity import downwards
+from calib_planner.error_model.joint_functions import spectrum
+from calib_planner.error_model.placement import joint_zeros
+from calib_planner.error_model.poses import joint_units
+from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.instrument.noise import Isotropic, LaserTracker
+
+ROBOTS = {
+    "kr270 full": lambda: Robot.load("kuka_kr270").with_parameters("full", ("base", "tool")),
+    "ur10e": lambda: Robot.load("ur10e").with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05]]),
+    "mixed full": lambda: mixed().with_parameters("full", ("base", "tool")),
+}
+
+
+@pytest.fixture(params=ROBOTS)
+def robot(request: pytest.FixtureRequest) -> Robot:
+    made = ROBOTS[request.param]()
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    return made.with_base(turn, [0.3, -0.2, 0.1])
+
+
+def test_every_column_moves_the_points_as_its_deflection_does(robot: Robot) -> None:
+    model = typical()
+    q = random_configurations(robot, 5)
+    poses = Poses(robot, q)
+    columns, where = model.columns(poses), model.slices(robot)
+    rng = np.random.default_rng(1)
+    for term in (model.gravity, model.joint_functions):
+        assert term is not None
+        coefficients = np.zeros(columns.shape[2])
+        coefficients[where[term.name]] = rng.standard_normal(term.size(robot))
+        # Complex step through the kinematics: exact to rounding, and independent of the columns.
+        deflection = model.deflection(poses, coefficients) * joint_units(robot)
+        moved = robot._run(q + 1e-30j * deflection, np.zeros(len(robot.parameter_names)), columns=False)
+        slope = (moved.imag / 1e-30).reshape(len(robot.targets), 3, -1).transpose(2, 0, 1).reshape(5, -1)
+        np.testing.assert_allclose(columns @ coefficients, slope, atol=1e-12 * np.abs(slope).max())
+
+
+def test_placement_columns_are_the_jacobian_and_priors_go_by_kind(robot: Robot) -> None:
+    poses = Poses(robot, random_configurations(robot, 3))
+    placement, values = Placement(), {"placement.length": 4e-4, "placement.angle": 2e-3}
+    np.testing.assert_array_equal(placement.columns(poses), robot.jacobian(poses.q))
+    std = dict(zip(robot.parameter_names, np.sqrt(placement.variances(robot, values)), strict=True))
+    zeros = dict(zip(robot.parameter_names, joint_zeros(robot), strict=True))
+    for parameter in robot.parameters:
+        if parameter.name.startswith(("base.", "target_")):
+            assert np.isinf(std[parameter.name])
+        elif zeros[parameter.name]:
+            assert std[parameter.name] == pytest.approx(0.02)
+        else:
+            assert std[parameter.name] == pytest.approx(4e-4 if parameter.unit == "m" else 2e-3)
+    assert np.isinf(Placement("flat").variances(robot, {})).all()
+    name = robot.parameter_names[7]
+    stated = Placement(stated=((name, 3e-5),)).variances(robot, values)
+    assert (
+        stated[7] == pytest.approx(9e-10) and np.isfinite(stated).sum() >= np.isfinite(list(std.values())).sum()
+    )
+
+
+def test_zeros_of_joints_are_what_acts_like_the_joint() -> None:
+    robot = Robot.load("kuka_kr270").with_parameters("q1,q3,d2")
+    assert joint_zeros(robot).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("term", ["placement", "gravity", "joint_functions"])
+def test_slopes_of_priors_are_derivatives(term: str) -> None:
+    robot, model, step = ROBOTS["kr270 full"](), typical(), 1e-6
+    part = getattr(model, term)
+    slopes = part.slopes(robot, model.values)
+    assert set(slopes) == set(part.scales)
+    for name, slope in slopes.items():
+        sides = [
+            part.variances(robot, model.values | {name: model.values[name] * np.exp(s)}) for s in (step, -step)
+        ]
+        finite = np.isfinite(sides[0])
+        numeric = (sides[0][finite] - sides[1][finite]) / (2 * step)
+        np.testing.assert_allclose(slope[finite], numeric, atol=1e-8 * np.abs(numeric).max())
+
+
+# ── gravity ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("mounting", ["floor", "ceiling", (1.0, 0.0, 0.0)])
+def test_moments_are_the_slope_of_the_potential_energy(robot: Robot, mounting: str | tuple[float, ...]) -> None:
+    """τ_l = −∂E/∂q_l of a unit weight, E its height: by complex steps through a chain that ends at the mass."""
+    gravity = Gravity((Mass("hand", None, (0.1, 0.2, 0.3)),), mounting)  # type: ignore[arg-type]
+    q = random_configurations(robot, 4)
+    hand = replace(robot, parameter_names=()).with_targets([[0.1, 0.2, 0.3]])
+    down = robot.base_pose[0] @ gravity.down
+    moments = gravity._moments(Poses(robot, q))
+    for joint in range(len(robot.joint_names)):
+        moved = hand._run(q + 1e-30j * np.eye(len(robot.joint_names))[joint], np.zeros(0), columns=False)
+        np.testing.assert_allclose(moments[:, joint], (moved.imag / 1e-30).T @ down, atol=1e-12)
+
+
+def test_a_mass_on_a_link_loads_only_the_joints_before_it(robot: Robot) -> None:
+    gravity = Gravity((Mass("link", 1, (0.1, 0.0, 0.2)),))
+    assert [n.split(".")[-1] for n in gravity.names(robot)] == list(robot.joint_names[:2])
+    q = random_configurations(robot, 3)
+    other = q.copy()
+    other[:, 2:] += 0.3
+    np.testing.assert_allclose(
+        gravity._moments(Poses(robot, q)), gravity._moments(Poses(robot, other)), atol=1e-12
+    )
+
+
+def test_parts_of_one_mass_share_coefficients_and_the_payload_follows_the_visit(robot: Robot) -> None:
+    parts = (Mass("arm", 1, (0.1, 0.0, 0.2), 0.75), Mass("arm", None, (0.0, 0.0, 0.1), 0.25))
+    both, poses = Gravity(parts), Poses(robot, random_configurations(robot, 3))
+    each = [Gravity((replace(p, name="one", weight=1.0),))._moments(poses) for p in parts]
+    expected = 0.25 * each[1]
+    expected[:, :2] += 0.75 * each[0]
+    np.testing.assert_allclose(both._moments(poses), expected, atol=1e-15)
+    payload, load = Gravity((Mass("payload", None, (0.0, 0.0, 0.1)),)), np.array([0.0, 0.5, 1.0])
+    np.testing.assert_allclose(
+        payload._moments(replace(poses, load=load)), payload._moments(poses) * load[:, None], atol=1e-15
+    )
+
+
+def test_masses_stand_at_elbow_wrist_and_tip() -> None:
+    names = [m.name for m in Gravity().masses_of(Robot.load("ur10e"))]
+    assert names == ["elbow", "wrist", "tip"]
+    assert [m.name for m in Gravity().masses_of(Robot.load("planar_2r"))] == ["tip"]
+
+
+def test_the_mounting_is_found_from_the_trackers_vertical() -> None:
+    tilted = Robot.load("ur10e").with_base([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], [1.0, 2.0, 3.0])
+    gravity = Gravity(mounting=downwards(tilted, [0.0, 0.0, 2.0]))
+    np.testing.assert_allclose(tilted.base_pose[0] @ gravity.down, [0.0, 0.0, -1.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("mounting", ["wall", (0.0, 0.0, 0.0), (1.0, 2.0)])
+def test_a_mounting_is_a_word_or_a_direction(mounting: object) -> None:
+    with pytest.raises(InputError, match="mounting"):
+        Gravity(mounting=mounting)  # type: ignore[arg-type]
+
+
+# ── joint functions ──────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(("length", "harmonics"), [(1.2, 12), (0.5, 24), (0.07, 200)])
+def test_the_spectrum_is_the_fourier_series_of_the_kernel(length: float, harmonics: int) -> None:
+    def kernel(x: float) -> float:
+        return float(np.exp((np.cos(x) - 1.0) / length**2))
+
+    constant = quad(kernel, 0, np.pi, limit=400)[0] / np.pi
+    shares, _ = spectrum(length, harmonics)
+    for n in (1, 2, 5, 10):
+        wave = quad(kernel, 0, np.pi, weight="cos", wvar=n, limit=400)[0] * 2.0 / np.pi
+        assert shares[n - 1] == pytest.approx(wave / (1.0 - constant), rel=1e-6, abs=1e-12)
+    x = np.linspace(0.0, np.pi, 50)
+    series = np.cos(np.outer(x, np.arange(1, harmonics + 1))) @ shares
+    closed = (np.exp((np.cos(x) - 1.0) / length**2) - constant) / (1.0 - constant)
+    np.testing.assert_allclose(series, closed, atol=1e-9)
+
+
+def test_the_prior_of_a_joint_function_has_the_kernel_as_covariance() -> None:
+    robot, values = Robot.load("ur10e"), {"smooth.size": 3e-4, "smooth.length": 0.8}
+    term = JointFunctions(("smooth",), 40)
+    q = random_configurations(robot, 6)
+    waves = term.waves(Poses(robot, q))
+    variances = term.variances(robot, values).reshape(6, -1)
+    for joint in range(6):
+        covariance = (waves[:, joint] * variances[joint]) @ waves[:, joint].T
+        apart = q[:, joint, None] - q[None, :, joint]
+        shares = spectrum(0.8, 40)[0]
+        expected = sum(s * np.cos(n * apart) for n, s in enumerate(shares, start=1)) * 9e-8
+        np.testing.assert_allclose(covariance, expected, atol=1e-18)
+
+
+def test_components_are_known_and_named_once() -> None:
+    for wrong in (("rough",), ("short", "short"), ()):
+        with pytest.raises(UnknownNameError):
+            JointFunctions(wrong)
+
+
+# ── visits and points ────────────────────────────────────────────────────────────────────────────────
+
+
+def test_visits_and_points_have_the_covariance_of_what_they_stand_for(robot: Robot) -> None:
+    """Drawn by brute force: joint errors, a common shift, and noise by direction and floor."""
+    model = typical(LaserTracker(station=np.array([3.0, 1.0, 0.5])), estimate_scale=True)
+    values = {"repeatability": 4e-4, "shared": 2e-4, "instrument": 30.0, "floor": 3e-4}
+    model = model.with_values(values)
+    poses, rng, draws = Poses(robot, random_configurations(robot, 1)), np.random.default_rng(0), 200_000
+    targets = len(robot.targets)
+    joints = rng.standard_normal((draws, len(robot.joint_names))) * 4e-4
+    error = joints @ poses.levers[0].T
+    error += np.tile(2e-4 * rng.standard_normal((draws, 3)), targets)
+    stated = model.points.noise.covariance(poses.points)[0]  # type: ignore[union-attr]
+    for t in range(targets):
+        noise = 30.0 * rng.standard_normal((draws, 3)) @ np.linalg.cholesky(stated[t]).T
+        error[:, 3 * t : 3 * t + 3] += noise + 3e-4 * rng.standard_normal((draws, 3))
+    if targets == 1:  # the common shift cannot be told from the floor, which stands for both
+        model = model.with_values({"floor": float(np.hypot(3e-4, 2e-4))})
+    expected = model.visit_covariance(poses)[0]
+    np.testing.assert_allclose(np.cov(error.T), expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_what_came_with_the_data_goes_before_the_instrument() -> None:
+    robot = Robot.load("ur10e")
+    poses = Poses(robot, random_configurations(robot, 2))
+    stated = np.broadcast_to(np.diag([1.0, 4.0, 9.0]) * 1e-10, (2, 1, 3, 3))
+    points = Points(Isotropic(1e-3), floor=False)
+    np.testing.assert_allclose(points.parts(poses, {}, stated)["instrument"], stated[:, 0])
+    np.testing.assert_allclose(points.parts(poses, {})["instrument"][0], 1e-6 * np.eye(3))
+
+
+def test_a_model_needs_its_scales_and_some_noise() -> None:
+    scales = typical().scales
+    with pytest.raises(InputError, match="scales"):
+        ErrorModel(Placement(), Gravity(), None, None, Points(), scales[:2])
+    with pytest.raises(InputError, match="noise"):
+        ErrorModel(Placement(), None, None, None, Points(floor=False), scales)
+    slim = ErrorModel(Placement("flat"), None, None, Visits(shared=False), Points(), scales)
+    assert [s.name for s in slim.scales] == ["repeatability", "floor"]
+    with pytest.raises(UnknownNameError):
+        slim.with_values({"gravity": 1.0})
