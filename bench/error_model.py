@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot
-from calib_planner.error_model import ErrorModel, typical
-from calib_planner.error_model.knowledge import Knowledge
-from calib_planner.files.measurements_csv import read_measurements
-from calib_planner.identification.estimation import ModelEstimate, estimate
-from calib_planner.identification.measurements import Measurements
-from calib_planner.instrument.noise import Isotropic, LaserTracker, Noise
+from calib_planner.error_model import ErrorModel, Knowledge
+from calib_planner.identification import ModelEstimate, fit_error_model
+from calib_planner.io import read_measurements, typical
+from calib_planner.measurements import Measurements
+from calib_planner.tracker import Isotropic, LaserTracker, Noise
 
 ROOT = Path(__file__).resolve().parents[1]
 INSIDE = 1.959964
@@ -56,7 +55,7 @@ def judge(known: Knowledge, data: Measurements, found: ModelEstimate, seconds: f
 def timed(robot: Robot, data: Measurements, model: ErrorModel) -> tuple[ModelEstimate, float]:
     """The estimate and how long it took."""
     began = time.process_time()
-    found = estimate(robot, data, model)
+    found = fit_error_model(robot, data, model)
     return found, time.process_time() - began
 
 

@@ -23,11 +23,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner._arrays import FloatArray, check_array
+from calib_planner.arrays import FloatArray, check_array
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.chain import Robot, target_elements
-from calib_planner.robot.elements import Element
+from calib_planner.robot import Element, Robot, target_elements
 
 MOUNTINGS = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0)}
 """Mounting → direction downwards in the frame of the robot's base. A wall needs a direction."""
@@ -118,7 +117,7 @@ class Gravity:
         """(K,) prior variance of each coefficient [rad²/m²]."""
         return np.full(len(self._pairs(robot)), values["gravity"] ** 2)
 
-    def slopes(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
+    def gradients(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (K,) derivative of ``variances`` by its logarithm."""
         return {"gravity": 2.0 * self.variances(robot, values)}
 

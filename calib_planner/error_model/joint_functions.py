@@ -25,10 +25,10 @@ from typing import ClassVar
 import numpy as np
 from scipy.special import ive
 
-from calib_planner._arrays import FloatArray, check_count
+from calib_planner.arrays import FloatArray, check_count
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import UnknownNameError
-from calib_planner.robot.chain import Robot
+from calib_planner.robot import Robot
 
 COMPONENTS = {"smooth": 12, "short": 64}
 """Component → harmonics that its lengths need."""
@@ -100,14 +100,14 @@ class JointFunctions:
         ]
         return self._spread(robot, np.sum(shares, axis=0))
 
-    def slopes(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
+    def gradients(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (K,) derivative of ``variances`` by its logarithm."""
         result = {}
         for c in self.components:
-            share, slope = spectrum(values[f"{c}.length"], self.harmonics)
+            share, gradient = spectrum(values[f"{c}.length"], self.harmonics)
             variance = values[f"{c}.size"] ** 2
             result[f"{c}.size"] = self._spread(robot, 2.0 * variance * share)
-            result[f"{c}.length"] = self._spread(robot, variance * slope)
+            result[f"{c}.length"] = self._spread(robot, variance * gradient)
         return result
 
     def _spread(self, robot: Robot, per_order: FloatArray) -> FloatArray:
@@ -121,5 +121,5 @@ def spectrum(length: float, harmonics: int) -> tuple[FloatArray, FloatArray]:
     share = bessel[1:-1]
     by_kappa = 0.5 * (bessel[:-2] + bessel[2:]) - share  # of exp(−κ) I_n(κ)
     total = share.sum()
-    slope = (by_kappa - share * by_kappa.sum() / total) / total
-    return share / total, -2.0 * kappa * slope
+    gradient = (by_kappa - share * by_kappa.sum() / total) / total
+    return share / total, -2.0 * kappa * gradient

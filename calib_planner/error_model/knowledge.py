@@ -1,4 +1,4 @@
-"""What is known of a robot, and what that is worth: (M2), (M3) and the prediction of any point.
+"""What is known of a robot, and how well: (M2), (M3) and the prediction of any point.
 
 Measuring the configurations q_i gives, with the columns J⁺ of parameters and other coefficients β, their prior
 precision M₀ and the covariance R_i of a visit,
@@ -31,11 +31,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib_planner._arrays import FloatArray, check_configurations
+from calib_planner.arrays import FloatArray, check_configurations
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.chain import Robot
+from calib_planner.robot import Robot
 
 ACCURACIES = ("world", "robot")
 ROUNDING = 1e-13
@@ -193,18 +193,18 @@ class Knowledge:
         """
         names = self.model.names(self.robot)
         count = len(self.robot.parameter_names)
-        kept = [i for i, n in enumerate(names) if i >= count or not n.startswith("target_")]
+        chosen = [i for i, n in enumerate(names) if i >= count or not n.startswith("target_")]
         robot = self.robot.with_targets(xyz)
         chain = [n for n in self.robot.parameter_names if not n.startswith("target_")]
         new = [f"target_{t + 1}.{a}" for t in range(len(robot.targets)) for a in "xyz"]
         robot = replace(robot, parameter_names=(*chain, *new))
-        old = [kept.index(names.index(n)) for n in chain]
-        place = np.array([*old, *([-1] * len(new)), *range(len(chain), len(kept))])
+        old = [chosen.index(names.index(n)) for n in chain]
+        place = np.array([*old, *([-1] * len(new)), *range(len(chain), len(chosen))])
         there = place >= 0
-        coefficients = np.where(there, self.coefficients[kept][place], 0.0)
-        covariance = self.covariance[np.ix_(kept, kept)][np.ix_(place, place)] * np.outer(there, there)
+        coefficients = np.where(there, self.coefficients[chosen][place], 0.0)
+        covariance = self.covariance[np.ix_(chosen, chosen)][np.ix_(place, place)] * np.outer(there, there)
         covariance[~there, ~there] = UNKNOWN**2
-        hidden = self.hidden[kept][place] * there[:, None]
+        hidden = self.hidden[chosen][place] * there[:, None]
         return Knowledge(robot, self.model, coefficients, covariance, hidden)
 
     def updated(

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray, check_number
+from calib_planner.arrays import FloatArray, check_number
 from calib_planner.error_model.gravity import Gravity
 from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.placement import Placement
@@ -27,8 +27,8 @@ from calib_planner.error_model.points import Points
 from calib_planner.error_model.poses import Poses
 from calib_planner.error_model.visits import Visits
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.instrument.noise import Isotropic, Noise
-from calib_planner.robot.chain import Robot
+from calib_planner.robot import Robot
+from calib_planner.tracker import Isotropic, Noise
 
 UNKNOWN_SIGMA = 1e-4
 """Standard deviation of a coordinate to begin with where nothing is known of it [m]."""
@@ -192,14 +192,14 @@ class ErrorModel:
         """(coefficients,) prior variances, infinite where flat [unit²]; M₀ is the diagonal of their inverses."""
         return np.concatenate([term.variances(robot, self.values) for term in self.systematic])
 
-    def slopes(self, robot: Robot) -> dict[str, FloatArray]:
+    def gradients(self, robot: Robot) -> dict[str, FloatArray]:
         """Scale → (coefficients,) derivative of ``variances`` by its logarithm, for scales that are not known."""
         where, result = self.slices(robot), {}
         count = sum(term.size(robot) for term in self.systematic)
         for term in self.systematic:
-            for name, slope in term.slopes(robot, self.values).items():
+            for name, gradient in term.gradients(robot, self.values).items():
                 whole = np.zeros(count)
-                whole[where[term.name]] = slope
+                whole[where[term.name]] = gradient
                 result[name] = whole
         return {s.name: result[s.name] for s in self.scales if not s.known and s.name in result}
 
@@ -208,8 +208,8 @@ class ErrorModel:
     ) -> FloatArray:
         """R_i of (M2), (N, 3·targets, 3·targets) [m²]; see ``visit_parts``."""
         parts = self.visit_parts(poses, stated)
-        kept = [v for n, v in parts.items() if not points_only or n in ("instrument", "floor")]
-        return np.asarray(np.sum(kept, axis=0))
+        chosen = [v for n, v in parts.items() if not points_only or n in ("instrument", "floor")]
+        return np.asarray(np.sum(chosen, axis=0))
 
     def visit_parts(self, poses: Poses, stated: FloatArray | None = None) -> dict[str, FloatArray]:
         """Scale → its part of R_i; each is proportional to the square of its scale.

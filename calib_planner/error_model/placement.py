@@ -18,10 +18,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner._arrays import FloatArray
+from calib_planner.arrays import FloatArray
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot.chain import Robot
+from calib_planner.robot import Robot
 
 ZERO = 0.02
 """Standard deviation of the zero of a joint, in any unit [rad | m]."""
@@ -84,13 +84,13 @@ class Placement:
             variances[robot.parameter_names.index(name)] = std**2
         return variances
 
-    def slopes(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
+    def gradients(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (P,) derivative of ``variances`` by its logarithm."""
         result: dict[str, FloatArray] = {}
         for name, rows in self._rows(robot).items():
-            slope = np.zeros(len(robot.parameter_names))
-            slope[rows] = 2.0 * values[name] ** 2
-            result[name] = slope
+            gradient = np.zeros(len(robot.parameter_names))
+            gradient[rows] = 2.0 * values[name] ** 2
+            result[name] = gradient
         return result
 
     def _rows(self, robot: Robot) -> dict[str, BoolArray]:

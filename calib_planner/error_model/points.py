@@ -16,9 +16,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner.arrays import FloatArray
 from calib_planner.error_model.poses import Poses
-from calib_planner.instrument.noise import Noise
+from calib_planner.tracker import Noise
 
 
 @dataclass(frozen=True)

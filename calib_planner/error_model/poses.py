@@ -12,10 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
-from calib_planner.robot.chain import Robot
-from calib_planner.robot.linearisation import Linearisation
-from calib_planner.robot.posture import Posture
+from calib_planner.arrays import FloatArray
+from calib_planner.robot import Linearisation, Posture, Robot
 
 SLIDE = 0.15
 """A sliding joint errs by as many metres as a turning joint moves a point this far from its axis [m]."""

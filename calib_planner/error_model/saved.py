@@ -19,7 +19,7 @@ from calib_planner.error_model.placement import Placement
 from calib_planner.error_model.points import Points
 from calib_planner.error_model.visits import Visits
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
-from calib_planner.instrument.noise import Isotropic, LaserTracker, Noise
+from calib_planner.tracker import Isotropic, LaserTracker, Noise
 
 NOISES = {"isotropic": Isotropic, "laser_tracker": LaserTracker}
 

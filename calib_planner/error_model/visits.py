@@ -18,7 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
+from calib_planner.arrays import FloatArray
 from calib_planner.error_model.poses import Poses
 
 

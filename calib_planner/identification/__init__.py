@@ -21,6 +21,7 @@ from calib_planner.identification.estimate import (
     Verdict,
     without_noise,
 )
+from calib_planner.identification.estimation import ModelEstimate, fit_error_model
 from calib_planner.identification.evidence import fit_placement
 from calib_planner.identification.least_squares import SAME_JOINT, configuration_labels
 from calib_planner.identification.noise_levels import DOUBT, FEWEST_SPARE, NoiseLevels, improbable

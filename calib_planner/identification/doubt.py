@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from calib_planner._arrays import FloatArray, IntArray
+from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.identification.left_out import left_out
 from calib_planner.identification.likelihood import Solution
 

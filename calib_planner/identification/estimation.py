@@ -19,10 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
-from calib_planner.error_model.knowledge import Knowledge
-from calib_planner.error_model.model import ErrorModel
-from calib_planner.error_model.poses import Poses
+from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel, Knowledge, Poses
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.doubt import (
     LARGEST,
@@ -42,11 +40,11 @@ from calib_planner.identification.likelihood import (
     solve,
     with_uncertain_scales,
 )
-from calib_planner.identification.measurements import Measurements
 from calib_planner.identification.registration import place, tip_poses
-from calib_planner.identification.term_worth import TermWorth, term_worths
-from calib_planner.instrument.noise import Isotropic
-from calib_planner.robot.chain import Robot
+from calib_planner.identification.term_gain import TermGain, term_gains
+from calib_planner.measurements import Measurements
+from calib_planner.robot import Robot
+from calib_planner.tracker import Isotropic
 
 MOST_STARTS = 20
 """Most relinearisations at typical scales."""
@@ -91,7 +89,7 @@ class ModelEstimate:
     knowledge: Knowledge
     left_out: LeftOut
     doubt: FloatArray
-    terms: tuple[TermWorth, ...]
+    terms: tuple[TermGain, ...]
     solution: Solution
     rounds: int
     converged: bool
@@ -249,7 +247,7 @@ class _Work:
             self.state = replace(before, coefficients=before.coefficients[kept], model=solution.problem.model)
 
 
-def estimate(
+def fit_error_model(
     robot: Robot,
     data: Measurements,
     model: ErrorModel,
@@ -324,7 +322,7 @@ def _estimate(
         knowledge=known,
         left_out=left_out(solution),
         doubt=work.state.doubt,
-        terms=term_worths(model, solution.problem, work.state.coefficients, gains),
+        terms=term_gains(model, solution.problem, work.state.coefficients, gains),
         solution=solution,
         rounds=work.rounds,
         converged=work.converged,

@@ -34,9 +34,9 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.lapack import dpotri
 
-from calib_planner._arrays import FloatArray, IntArray
-from calib_planner.error_model.model import ErrorModel
-from calib_planner.robot.chain import Robot
+from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.error_model import ErrorModel
+from calib_planner.robot import Robot
 
 RANK = 1e-7
 """Singular values of the flat columns, of unit length, below this share of the largest count as zero."""
@@ -116,9 +116,9 @@ class LinearProblem:
     @cached_property
     def ratios(self) -> dict[str, FloatArray]:
         """Scale that the data decide → (K,) ∂ log λ_k by its logarithm."""
-        slopes = {name: slope[self.random] for name, slope in self.model.slopes(self.robot).items()}
+        gradients = {name: gradient[self.random] for name, gradient in self.model.gradients(self.robot).items()}
         there = self.root > 1e-145
-        return {n: np.where(there, s, 0.0) / np.where(there, self.root**2, 1.0) for n, s in slopes.items()}
+        return {n: np.where(there, s, 0.0) / np.where(there, self.root**2, 1.0) for n, s in gradients.items()}
 
     def expand(self, reduced: FloatArray) -> FloatArray:
         """β (coefficients, …) of γ and Λ^-½ u (rank + K, …)."""
@@ -323,8 +323,8 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 def unknown_scales(model: ErrorModel, parts: Mapping[str, FloatArray], robot: Robot) -> tuple[str, ...]:
     """Scales that the data decide: not known, and with a part or a column here."""
-    slopes = model.slopes(robot)
-    return tuple(s.name for s in model.scales if not s.known and (s.name in parts or s.name in slopes))
+    gradients = model.gradients(robot)
+    return tuple(s.name for s in model.scales if not s.known and (s.name in parts or s.name in gradients))
 
 
 def penalty(model: ErrorModel, names: tuple[str, ...]) -> tuple[float, FloatArray, FloatArray]:
@@ -374,8 +374,8 @@ def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], Flo
         if ratio is not None:
             pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
             direct[problem.random, at] = ratio * solution.coefficients[problem.random]
-    slope = direct - solution.coefficients_of(pushes)
-    return np.asarray(result + slope @ covariance @ slope.T)
+    gradient = direct - solution.coefficients_of(pushes)
+    return np.asarray(result + gradient @ covariance @ gradient.T)
 
 
 def scale_covariance(solution: Solution) -> tuple[tuple[str, ...], FloatArray]:
@@ -402,10 +402,10 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
         return best
     if len(names) == 1:  # the paper's: the search to the end costs nothing
         settled = min(settled, 1e-12)
-    prior, slope, curve = penalty(problem.model, names)
+    prior, gradient, curve = penalty(problem.model, names)
     for _ in range(rounds):
         gradient, information = derivatives(best, names)
-        gradient, information = gradient + slope, information + np.diag(curve)
+        gradient, information = gradient + gradient, information + np.diag(curve)
         step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
         step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
         if -(gradient @ step) < settled:
@@ -419,7 +419,7 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
             step = 0.5 * step
         else:
             break
-        best, (prior, slope, curve) = trial, trial_prior
+        best, (prior, gradient, curve) = trial, trial_prior
     return best
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         write_configurations,
         write_measurements,
     )
+    from calib_planner.io.error_model import read_error_model, typical, write_error_model
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
     from calib_planner.io.kinematics import read_kinematics, write_kinematics
     from calib_planner.io.plan import read_plan, write_plan
@@ -75,6 +76,7 @@ else:
             "conditions": "read_constraints read_instrument",
             "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
             "read_plan_csv write_configurations write_measurements",
+            "error_model": "read_error_model typical write_error_model",
             "estimate": "calibrated_robot placement read_estimate write_estimate",
             "kinematics": "read_kinematics write_kinematics",
             "plan": "read_plan write_plan",

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from robots import SHARED_DATA, random_configurations
 
 from calib_planner import Robot
-from calib_planner._arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Gravity, typical
-from calib_planner.identification.estimation import ModelEstimate, estimate
-from calib_planner.identification.measurements import Measurements
-from calib_planner.instrument.noise import Isotropic
+from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel, Gravity
+from calib_planner.identification import ModelEstimate, fit_error_model
+from calib_planner.io import typical
+from calib_planner.measurements import Measurements
+from calib_planner.tracker import Isotropic
 
 ALL = {"gravity": 2e-3, "smooth.size": 3e-4, "repeatability": 5e-5, "shared": 3e-5}
 
@@ -48,7 +49,7 @@ def test_the_papers_model_is_plain_least_squares(sigma: float | None) -> None:
         deviations = deviations + np.linalg.lstsq(rows, right, rcond=None)[0]
     variance = 9e-10 if sigma else float(right @ right) / (len(right) - count)
     covariance = variance * np.linalg.inv(rows.T @ rows)
-    found = estimate(robot, Measurements(robot.joint_names, q, points), ErrorModel.paper(sigma))
+    found = fit_error_model(robot, Measurements(robot.joint_names, q, points), ErrorModel.paper(sigma))
     np.testing.assert_allclose(found.knowledge.coefficients, deviations, atol=1e-9)
     np.testing.assert_allclose(found.knowledge.covariance, covariance, rtol=2e-3, atol=1e-6 * covariance.max())
     if sigma:
@@ -69,7 +70,7 @@ def test_what_is_predicted_is_achieved(scales: dict[str, float], heavy: bool) ->
     robot, ratios, inside = ur10e(2), [], []
     for seed in range(3):
         data, truth = simulated(robot, scales, 190, seed, heavy)
-        found = estimate(unknown(robot), data.select(np.arange(40)), typical())
+        found = fit_error_model(unknown(robot), data.select(np.arange(40)), typical())
         distance, ratio = fresh_errors(found, data, 40)
         told = found.knowledge.predict(data.q[40:])
         std = np.sqrt(np.diagonal(told.position, axis1=2, axis2=3))
@@ -87,7 +88,7 @@ def test_what_is_predicted_is_achieved(scales: dict[str, float], heavy: bool) ->
 def test_gravity_is_found_and_a_term_that_is_not_there_goes() -> None:
     robot = ur10e(2)
     data, _ = simulated(robot, {"gravity": 3e-3}, 40, 5)
-    found = estimate(unknown(robot), data, typical())
+    found = fit_error_model(unknown(robot), data, typical())
     worth = {t.name: t for t in found.terms}
     assert worth["gravity"].kept and worth["gravity"].gain > 10.0 and worth["gravity"].size > 1e-4
     assert not worth["short"].kept and worth["short"].gain <= 0.0 and worth["short"].size == 0.0
@@ -98,7 +99,7 @@ def test_a_mounting_that_is_not_the_robots_predicts_worse() -> None:
     robot = ur10e(2)
     data, _ = simulated(robot, {"gravity": 4e-3}, 40, 6)
     scores = [
-        estimate(unknown(robot), data, typical(gravity=Gravity(mounting=m)), choose=False).left_out.score
+        fit_error_model(unknown(robot), data, typical(gravity=Gravity(mounting=m)), choose=False).left_out.score
         for m in ("floor", (1.0, 0.0, 0.0))
     ]
     assert scores[0] > scores[1] + 10.0
@@ -109,7 +110,7 @@ def test_errors_that_targets_share_are_no_trouble_without_sigma(targets: int) ->
     """Noise far below what the targets of a visit share: the covariance of a visit is nearly singular."""
     robot = ur10e(targets)
     data, _ = simulated(robot, {"shared": 2e-4, "floor": 1e-7}, 60, 2)
-    found = estimate(unknown(robot), data.select(np.arange(30)), typical())
+    found = fit_error_model(unknown(robot), data.select(np.arange(30)), typical())
     assert found.converged
     distance, ratio = fresh_errors(found, data, 30)
     assert 0.75 < ratio < 1.35 and np.sqrt(np.mean(distance**2)) < 6e-4
@@ -121,7 +122,7 @@ def test_points_that_were_not_seen_are_as_if_they_had_not_been_asked_for() -> No
     points = np.array(data.p)
     points[3, 1], points[10] = np.nan, np.nan
     some = Measurements(robot.joint_names, data.q, points).select(np.arange(40))
-    found = estimate(unknown(robot), some, typical())
+    found = fit_error_model(unknown(robot), some, typical())
     assert found.left_out.residuals[10].max() == 0.0 and found.left_out.scores[10] == pytest.approx(0.0, abs=1e-9)
     distance, _ = fresh_errors(found, data, 40)
     assert np.sqrt(np.mean(distance**2)) < 9e-5
@@ -130,9 +131,9 @@ def test_points_that_were_not_seen_are_as_if_they_had_not_been_asked_for() -> No
 def test_a_stated_instrument_is_believed_and_its_scale_is_found_if_asked() -> None:
     robot = ur10e(2)
     data, _ = simulated(robot, {"floor": 1e-4}, 80, 1)
-    believed = estimate(unknown(robot), data, typical(Isotropic(1e-4)))
+    believed = fit_error_model(unknown(robot), data, typical(Isotropic(1e-4)))
     assert believed.knowledge.model.values["floor"] < 5e-5
-    scaled = estimate(unknown(robot), data, typical(Isotropic(5e-5), estimate_scale=True))
+    scaled = fit_error_model(unknown(robot), data, typical(Isotropic(5e-5), estimate_scale=True))
     values = scaled.knowledge.model.values
     assert np.hypot(5e-5 * values["instrument"], values["floor"]) == pytest.approx(1e-4, rel=0.15)
 
@@ -143,7 +144,7 @@ def test_standard_deviations_that_came_with_the_points_weigh_them_and_are_expect
     rng = np.random.default_rng(0)
     std = np.where(np.arange(60)[:, None, None] % 2, 1e-3, 2e-5) * np.ones((60, 1, 3))
     noisy = Measurements(robot.joint_names, data.q, data.p + std * rng.standard_normal(std.shape), std)
-    found = estimate(unknown(robot), noisy, typical())
+    found = fit_error_model(unknown(robot), noisy, typical())
     apart = found.knowledge.predict(data.q).mean - truth.poses(data.q).points
     assert np.sqrt(np.mean(apart**2)) < 1e-4  # the noisy half alone would leave far more
     noise = np.sqrt(np.trace(found.knowledge.predict(data.q[:1]).noise[0, 0]) / 3.0)
@@ -178,8 +179,8 @@ def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> N
     data, _ = simulated(robot, scales, 160, 7)
     points = np.array(data.p)
     bad = spoil(how, points, np.random.default_rng(0))
-    clean = estimate(unknown(robot), data.select(np.arange(40)), typical())
-    found = estimate(unknown(robot), Measurements(robot.joint_names, data.q[:40], points[:40]), typical())
+    clean = fit_error_model(unknown(robot), data.select(np.arange(40)), typical())
+    found = fit_error_model(unknown(robot), Measurements(robot.joint_names, data.q[:40], points[:40]), typical())
     assert ((found.doubt > 0) == bad).all()
     (good, _), (distance, ratio) = fresh_errors(clean, data, 40), fresh_errors(found, data, 40)
     assert distance.mean() < 1.3 * good.mean()
@@ -199,7 +200,7 @@ def test_a_measured_irb120() -> None:
         .with_parameters("full", ("base", "tool"))
     )
     data = Measurements(robot.joint_names, rows[:, :6], rows[:, 6:].reshape(-1, 3, 3))
-    found = estimate(robot, data, typical())
+    found = fit_error_model(robot, data, typical())
     test = np.loadtxt(folder / "test_2.csv", delimiter=",", skiprows=1)
     known = found.knowledge.with_new_targets(found.knowledge.robot.target_offsets[:1])
     known = known.updated(test[:1, :6], test[:1, None, 6:])

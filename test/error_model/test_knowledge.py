@@ -9,12 +9,13 @@ import pytest
 from robots import mixed, random_configurations
 
 from calib_planner import Robot
-from calib_planner._arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points, typical
+from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points
 from calib_planner.error_model.knowledge import Knowledge, prior_information
 from calib_planner.error_model.knowledge import information as information_of
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.instrument.noise import Isotropic, LaserTracker
+from calib_planner.io import typical
+from calib_planner.tracker import Isotropic, LaserTracker
 
 SIGMA = 3e-5
 TEST = np.array([0.0, -1.1, 1.5, 0.0, 0.8, 0.0])

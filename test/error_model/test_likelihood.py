@@ -10,8 +10,8 @@ import pytest
 from fits import problem_of, simulated, total_covariance, unknown, ur10e
 from robots import random_configurations
 
-from calib_planner.error_model import ErrorModel, Placement, typical
-from calib_planner.identification.estimation import _Work, estimate
+from calib_planner.error_model import ErrorModel, Placement
+from calib_planner.identification.estimation import _Work, fit_error_model
 from calib_planner.identification.left_out import left_out
 from calib_planner.identification.likelihood import (
     LinearProblem,
@@ -25,6 +25,7 @@ from calib_planner.identification.likelihood import (
     unknown_scales,
     with_uncertain_scales,
 )
+from calib_planner.io import typical
 
 CASES: dict[str, Callable[[], LinearProblem]] = {
     "one target": lambda: problem_of(14, 1),
@@ -89,15 +90,15 @@ def test_the_gradient_is_the_derivative(
 ) -> None:
     names = unknown_scales(problem.model, problem.parts, problem.robot)
     gradient, _ = derivatives(form(problem), names)
-    for name, slope in zip(names, gradient, strict=True):
+    for name, gradient in zip(names, gradient, strict=True):
         value, step = problem.model.values[name], 1e-4
         sides = [
             form(problem.at(problem.model.with_values({name: value * np.exp(s)}))).value for s in (step, -step)
         ]
-        assert slope == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4, abs=1e-3)
-    _, slopes, _ = penalty(problem.model.with_values({names[0]: 1e-3}), names)
+        assert gradient == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4, abs=1e-3)
+    _, gradients, _ = penalty(problem.model.with_values({names[0]: 1e-3}), names)
     sides = [penalty(problem.model.with_values({names[0]: 1e-3 * np.exp(s)}), names)[0] for s in (1e-5, -1e-5)]
-    assert slopes[0] == pytest.approx((sides[0] - sides[1]) / 2e-5, rel=1e-6)
+    assert gradients[0] == pytest.approx((sides[0] - sides[1]) / 2e-5, rel=1e-6)
 
 
 def test_the_value_is_the_restricted_likelihood(problem: LinearProblem) -> None:
@@ -134,18 +135,18 @@ def test_what_uncertain_scales_add_is_the_slope_of_the_estimate(
 ) -> None:
     problem = problem_of(10, 2)
     names, covariance = scale_covariance(form(problem))
-    slopes = []
+    gradients = []
     for name in names:
         value, step = problem.model.values[name], 1e-4
         sides = [
             form(problem.at(problem.model.with_values({name: value * np.exp(s)}))).coefficients
             for s in (step, -step)
         ]
-        slopes.append((sides[0] - sides[1]) / (2 * step))
-    slope = np.transpose(slopes)
+        gradients.append((sides[0] - sides[1]) / (2 * step))
+    gradient = np.transpose(gradients)
     solution = form(problem)
     added = with_uncertain_scales(solution, (names, covariance)) - solution.posterior()
-    expected = slope @ covariance @ slope.T
+    expected = gradient @ covariance @ gradient.T
     np.testing.assert_allclose(added, expected, atol=1e-3 * np.abs(expected).max())
 
 
@@ -196,7 +197,7 @@ def test_thousands_of_points_are_the_same_problem() -> None:
     """The estimate from many visits (by coefficients) is the dense one of the same linear problem."""
     robot = ur10e(2)
     data, _ = simulated(robot, {"gravity": 2e-3}, 120, 1)
-    found = estimate(unknown(robot), data, typical())
+    found = fit_error_model(unknown(robot), data, typical())
     other = dense(found.solution.problem)
     np.testing.assert_allclose(
         other.coefficients, found.solution.coefficients, atol=1e-6 * np.abs(other.coefficients).max()

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from calib_planner.error_model import ErrorModel, Gravity, Mass, Placement, typical
-from calib_planner.error_model.saved import from_mapping, to_mapping
+from calib_planner.error_model import ErrorModel, Gravity, Mass, Placement, from_mapping, to_mapping
 from calib_planner.errors import InputError
-from calib_planner.instrument.noise import Isotropic, LaserTracker
+from calib_planner.io import typical
+from calib_planner.tracker import Isotropic, LaserTracker
 
 MODELS = {
     "typical": lambda: typical(),

@@ -1,4 +1,4 @@
-"""Each term's columns, prior and slopes against an oracle of its own."""
+"""Each term's columns, prior and gradients against an oracle of its own."""
 
 from __future__ import annotations
 
@@ -10,23 +10,14 @@ from robots import mixed, random_configurations
 from scipy.integrate import quad
 
 from calib_planner import Robot
-from calib_planner.error_model import (
-    ErrorModel,
-    Gravity,
-    JointFunctions,
-    Mass,
-    Placement,
-    Points,
-    Poses,
-    Visits,
-    typical,
-)
+from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points, Poses, Visits
 from calib_planner.error_model.gravity import downwards
 from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.instrument.noise import Isotropic, LaserTracker
+from calib_planner.io import typical
+from calib_planner.tracker import Isotropic, LaserTracker
 
 ROBOTS = {
     "kr270 full": lambda: Robot.load("kuka_kr270").with_parameters("full", ("base", "tool")),
@@ -55,8 +46,8 @@ def test_every_column_moves_the_points_as_its_deflection_does(robot: Robot) -> N
         # Complex step through the kinematics: exact to rounding, and independent of the columns.
         deflection = model.deflection(poses, coefficients) * joint_units(robot)
         moved = robot._run(q + 1e-30j * deflection, np.zeros(len(robot.parameter_names)), columns=False)
-        slope = (moved.imag / 1e-30).reshape(len(robot.targets), 3, -1).transpose(2, 0, 1).reshape(5, -1)
-        np.testing.assert_allclose(columns @ coefficients, slope, atol=1e-12 * np.abs(slope).max())
+        gradient = (moved.imag / 1e-30).reshape(len(robot.targets), 3, -1).transpose(2, 0, 1).reshape(5, -1)
+        np.testing.assert_allclose(columns @ coefficients, gradient, atol=1e-12 * np.abs(gradient).max())
 
 
 def test_placement_columns_are_the_jacobian_and_priors_go_by_kind(robot: Robot) -> None:
@@ -89,15 +80,15 @@ def test_zeros_of_joints_are_what_acts_like_the_joint() -> None:
 def test_slopes_of_priors_are_derivatives(term: str) -> None:
     robot, model, step = ROBOTS["kr270 full"](), typical(), 1e-6
     part = getattr(model, term)
-    slopes = part.slopes(robot, model.values)
-    assert set(slopes) == set(part.scales)
-    for name, slope in slopes.items():
+    gradients = part.gradients(robot, model.values)
+    assert set(gradients) == set(part.scales)
+    for name, gradient in gradients.items():
         sides = [
             part.variances(robot, model.values | {name: model.values[name] * np.exp(s)}) for s in (step, -step)
         ]
         finite = np.isfinite(sides[0])
         numeric = (sides[0][finite] - sides[1][finite]) / (2 * step)
-        np.testing.assert_allclose(slope[finite], numeric, atol=1e-8 * np.abs(numeric).max())
+        np.testing.assert_allclose(gradient[finite], numeric, atol=1e-8 * np.abs(numeric).max())
 
 
 # ── gravity ──────────────────────────────────────────────────────────────────────────────────────────

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib_planner._arrays import FloatArray
-from calib_planner.error_model.joint_functions import JointFunctions
-from calib_planner.error_model.model import ErrorModel
+from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel, JointFunctions
 from calib_planner.identification.likelihood import LinearProblem
 
 
 @dataclass(frozen=True, eq=False)
-class TermWorth:
+class TermGain:
     """What a term is worth.
 
     Attributes:
@@ -36,9 +35,9 @@ class TermWorth:
     kept: bool
 
 
-def term_worths(
+def term_gains(
     asked: ErrorModel, problem: LinearProblem, coefficients: FloatArray, gains: Mapping[str, float]
-) -> tuple[TermWorth, ...]:
+) -> tuple[TermGain, ...]:
     """Every term of the model ``asked`` for.
 
     Args:
@@ -54,7 +53,7 @@ def term_worths(
     ]
     nothing = float("nan")
     return tuple(
-        TermWorth(n, float(np.sqrt(squares.get(n, 0.0) / points)), gains.get(n, nothing), n in squares)
+        TermGain(n, float(np.sqrt(squares.get(n, 0.0) / points)), gains.get(n, nothing), n in squares)
         for n in names
     )
 

@@ -1,0 +1,86 @@
+"""Error models as files: what is expected of a robot that nobody has measured, and what an estimate has learnt.
+
+``config/error_models/typical.yaml`` holds the typical scales of the terms. A model is saved alone
+(``write_error_model``); its mapping is the same inside an estimate.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from calib_planner.error_model import (
+    ErrorModel,
+    Gravity,
+    JointFunctions,
+    Placement,
+    Points,
+    Scale,
+    Visits,
+    from_mapping,
+    to_mapping,
+)
+from calib_planner.io.robots import config_folder
+from calib_planner.io.yaml import read_document, read_yaml, write_document
+from calib_planner.tracker import Noise
+
+KIND = "error_model"
+
+
+def write_error_model(path: str | Path, model: ErrorModel, field: str = "output") -> None:
+    """Write a model alone.
+
+    Raises:
+        InputError: The path cannot be written; names ``field``.
+    """
+    write_document(path, KIND, {"error_model": to_mapping(model)}, field)
+
+
+def read_error_model(source: str | Path, noise: Noise | None = None) -> ErrorModel:
+    """A model by name or from a file.
+
+    Args:
+        source: ``paper``, ``typical``, or the path of a file that ``write_error_model`` wrote.
+        noise: The instrument, for the models with a name; a file holds its own.
+
+    Raises:
+        FileFormatError: The file is not readable, or holds what a model cannot hold; names the key.
+    """
+    if source == "paper":
+        return ErrorModel.paper(noise)
+    if source == "typical":
+        return typical(noise)
+    part = read_document(source, KIND)["error_model"]
+    return part.build(lambda: from_mapping(part.mapping().value))
+
+
+def typical(
+    noise: Noise | None = None,
+    *,
+    placement: Placement | None = None,
+    gravity: Gravity | None = None,
+    estimate_scale: bool = False,
+) -> ErrorModel:
+    """All terms with typical scales.
+
+    Args:
+        noise: The instrument, if it is known.
+        placement: What is known of the chain; default: typical tolerances.
+        gravity: What hangs on the joints and how the robot is mounted; default: unknown masses, on the floor.
+        estimate_scale: Whether the data decide by which factor the instrument's statement is wrong.
+    """
+    placed = Placement() if placement is None else placement
+    elastic = Gravity() if gravity is None else gravity
+    points = Points(noise, estimate_scale)
+    scales = typical_scales()
+    return ErrorModel(placed, elastic, JointFunctions(), Visits(), points, scales, "typical")
+
+
+@cache
+def typical_scales() -> tuple[Scale, ...]:
+    """The scales of the shipped file, each at its median."""
+    file = read_yaml(config_folder() / "error_models" / "typical.yaml", "the typical error model")
+    return tuple(
+        Scale(name, row["median"].number(), row["median"].number(), row["factor"].number(), row["unit"].text())
+        for name, row in file["scales"].entries()
+    )
