@@ -402,10 +402,10 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
         return best
     if len(names) == 1:  # the paper's: the search to the end costs nothing
         settled = min(settled, 1e-12)
-    prior, gradient, curve = penalty(problem.model, names)
+    prior, prior_gradient, curve = penalty(problem.model, names)
     for _ in range(rounds):
         gradient, information = derivatives(best, names)
-        gradient, information = gradient + gradient, information + np.diag(curve)
+        gradient, information = gradient + prior_gradient, information + np.diag(curve)
         step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
         step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
         if -(gradient @ step) < settled:
@@ -419,7 +419,7 @@ def maximise(problem: LinearProblem, rounds: int = 30, settled: float = SETTLED)
             step = 0.5 * step
         else:
             break
-        best, (prior, gradient, curve) = trial, trial_prior
+        best, (prior, prior_gradient, curve) = trial, trial_prior
     return best
 
 

@@ -90,12 +90,12 @@ def test_the_gradient_is_the_derivative(
 ) -> None:
     names = unknown_scales(problem.model, problem.parts, problem.robot)
     gradient, _ = derivatives(form(problem), names)
-    for name, gradient in zip(names, gradient, strict=True):
+    for name, derivative in zip(names, gradient, strict=True):
         value, step = problem.model.values[name], 1e-4
         sides = [
             form(problem.at(problem.model.with_values({name: value * np.exp(s)}))).value for s in (step, -step)
         ]
-        assert gradient == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4, abs=1e-3)
+        assert derivative == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-4, abs=1e-3)
     _, gradients, _ = penalty(problem.model.with_values({names[0]: 1e-3}), names)
     sides = [penalty(problem.model.with_values({names[0]: 1e-3 * np.exp(s)}), names)[0] for s in (1e-5, -1e-5)]
     assert gradients[0] == pytest.approx((sides[0] - sides[1]) / 2e-5, rel=1e-6)
