@@ -22,6 +22,7 @@ then ignored. The state is rebuilt by ``from_measurements``: what was planned an
     {"withdrawn": 7}
     {"excluded": […], "radius": 0.05, "reason": "…", …}
     {"joined": true}                                  the validation so far is part of the fit from here on
+    {"fit_plan": "3f2a…-fit-…", "plan": "{…}"}        the identifier has taken this plan of the fit
     {"finished": "reached"}
 
 Numbers are JSON in both, which Python writes and reads exactly to the bit; null is NaN (a target not seen).
@@ -690,6 +691,14 @@ class Journal:
             lines.append({"finished": after.outcome})
         self._append(lines)
 
+    def note_plan(self, plan_id: str, plan: Plan) -> None:
+        """Write which plan of the fit the identifier has taken.
+
+        Raises:
+            StoreError: It cannot be written.
+        """
+        self._append([{"fit_plan": plan_id, "plan": plan_text(plan)}])
+
     def _append(self, lines: list[dict[str, Any]]) -> None:
         if not lines:
             return
@@ -710,6 +719,8 @@ class StoredJournal:
         rows: ``(number, role, configuration, points)``.
         exclusions: Configurations given up.
         finished: The outcome; empty while it is not ended.
+        fit_plan: Name and plan of the fit that the identifier took last; ``None`` if there is none that holds the
+            validation which joined the fit.
     """
 
     journal: Journal
@@ -717,6 +728,7 @@ class StoredJournal:
     rows: tuple[tuple[int, str, list[float], list[Any]], ...] = ()
     exclusions: tuple[Exclusion, ...] = field(default=())
     finished: str = ""
+    fit_plan: tuple[str, Plan] | None = None
 
     def state(self, problem: CampaignProblem) -> CampaignState:
         """The campaign as far as it came.
@@ -784,6 +796,7 @@ def _folded(journal: Journal, lines: list[dict[str, Any]], robot: Robot) -> Stor
     rows: dict[int, tuple[int, str, list[float], list[Any]]] = {}
     exclusions: list[Exclusion] = []
     finished = ""
+    fit_plan: tuple[str, Plan] | None = None
     for line in lines[1:]:
         if "measured" in line:
             number, role = int(line["measured"]), str(line["role"])
@@ -797,12 +810,16 @@ def _folded(journal: Journal, lines: list[dict[str, Any]], robot: Robot) -> Stor
             exclusions.append(Exclusion(-1, q, float(line["radius"]), str(line["reason"]), bool(line["asked"])))
         elif "joined" in line:
             rows = {n: (n, FIT, q, points) for n, (_, _, q, points) in rows.items()}
+            fit_plan = None
+        elif "fit_plan" in line:
+            plan = plan_of(journal.path, line["plan"])
+            fit_plan = None if plan is None else (str(line["fit_plan"]), plan)
         elif "finished" in line:
             finished = str(line["finished"])
     for row in rows.values():
         _measurements(robot, [row])  # refuses what does not fit the robot
     return StoredJournal(
-        journal, str(lines[0]["campaign"])[:100], tuple(rows.values()), tuple(exclusions), finished
+        journal, str(lines[0]["campaign"])[:100], tuple(rows.values()), tuple(exclusions), finished, fit_plan
     )
 
 

@@ -181,6 +181,8 @@ class Measuring:
         visit: What is being measured; ``None`` if nothing is.
         waiting: What is awaited; empty if nothing is.
         taken: Name of the plan that the identifier has.
+        fit: The last plan of the fit that the identifier took; ``None`` if there is none that holds everything
+            that was measured for the fit.
     """
 
     def __init__(self, node: ManagedNode[CampaignParameters], plans: Publisher) -> None:
@@ -188,9 +190,10 @@ class Measuring:
         self._execution = PlanExecution(node, node.settings.value.execute_action)
         self.begin("")
 
-    def begin(self, campaign_id: str) -> None:
-        """Begin a campaign, of which the identifier knows no plan yet."""
+    def begin(self, campaign_id: str, fit_plan: tuple[str, Plan] | None = None) -> None:
+        """Begin a campaign, or go on with one of which the identifier took a plan of the fit."""
         self._id = campaign_id
+        self.fit = None if fit_plan is None else Announced(*fit_plan, (), FIT)
         self._plan: Announced | None = None
         self._plans: dict[str, Announced] = {}
         self.visit: Visit | None = None
@@ -214,15 +217,15 @@ class Measuring:
         self._execution.poll(self._settings.silence)
         self._execution.cancel()
 
-    def back_to_fit(self) -> None:
-        """Tell the identifier the last plan of the fit again."""
-        fit = self._last_fit
-        if fit is not None and self._plan is not fit:
-            self._announce(fit)
+    def joined(self) -> None:
+        """Forget what the identifier was told: measurements of a validation belong to the fit from now on."""
+        self.fit = self._plan = None
 
-    @property
-    def _last_fit(self) -> Announced | None:
-        return next((p for p in reversed(self._plans.values()) if p.role == FIT), None)
+    def back_to_fit(self, state: CampaignState) -> None:
+        """Tell the identifier the plan of the fit again."""
+        told = self._plan is not None and self._plan.role == FIT
+        if not told and state.measurements_of(FIT):
+            self._announce(self.fit or announced(state, self._id, FIT))
 
     def heard(self, message: Measurement, state: CampaignState) -> CampaignState:
         """Take what the identifier publishes about a standstill.
@@ -283,20 +286,20 @@ class Measuring:
         return self._node.settings.value
 
     def _tell(self, state: CampaignState, visit: Visit) -> None:
-        """Announce the plan and wait until the identifier has it, before the robot goes there."""
-        plan, fit = self._plan, self._last_fit
-        if fit is not None and not {m.index for m in state.measurements_of(FIT)} <= {*fit.numbers}:
-            # Measurements of a validation joined the fit: the identifier has to count them to it from now on.
-            plan = announced(state, self._id, FIT)
+        """Announce the plan and wait until the identifier has it, before the robot goes there.
+
+        At the identifier a new plan begins with the measurements of the plan before. Therefore the plan of the
+        fit has to be taken before that of a validation; else the fit would begin with what was validated.
+        """
+        plan, number = self._plan, visit.action.index
+        role = visit.action.role if self.fit is not None else FIT
+        if plan is None or plan.role != role or (role == visit.action.role and not plan.covers(number, state)):
+            plan = announced(state, self._id, role)
             self._announce(plan)
-        elif plan is not None and plan is fit and visit.action.role == VALIDATION and self.taken != plan.plan_id:
-            pass  # the identifier has to take the plan of the fit before it is told that of the validation
-        elif plan is None or not plan.covers(visit.action.index, state):
-            plan = announced(state, self._id, visit.action.role)
-            self._announce(plan)
-        if self.taken == plan.plan_id and plan.covers(visit.action.index, state):
+        if self.taken == plan.plan_id:
             self._wait_for("")
-            visit.next("sending")
+            self.fit = plan if role == FIT else self.fit
+            visit.next("sending" if role == visit.action.role else "telling")
         elif time.monotonic() - visit.since > RETRY:
             own = f"{self._node.get_fully_qualified_name()}/plan"
             self._wait_for(f"{self._settings.identifier} does not take the plan: is it there, plan_topic {own}?")

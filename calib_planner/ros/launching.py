@@ -42,8 +42,8 @@ def describe(part: str, name: str, kinds: Mapping[str, Callable[[str], Any]], *,
         namespace("namespace of the node"),
         DeclareLaunchArgument("parameters", default_value=default, description="YAML file of node parameters"),
     ]
-    for argument, kind in kinds.items():
-        choices = {"choices": ["", *TRUTH]} if kind is COMMON["autostart"] else {}
+    for argument in kinds:
+        choices = {"choices": ["", *TRUTH]} if argument in COMMON else {}
         arguments.append(
             DeclareLaunchArgument(argument, default_value="", description=DESCRIPTIONS[argument], **choices)
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import plan_of
 
 from calib_planner import FileFormatError, Robot
 from calib_planner.campaign import (
@@ -22,6 +23,7 @@ from calib_planner.campaign import (
 from calib_planner.errors import StoreError
 from calib_planner.io import Journal, begin_journal, open_journal
 from calib_planner.io.store import JOURNAL as FILE
+from calib_planner.io.store import same_plan
 
 ROBOT = Robot.load("planar_2r")
 PROBLEM = CampaignProblem(ROBOT, [0.2, 0.9], 1e-5)
@@ -73,6 +75,18 @@ def test_a_validation_that_joined_the_fit_is_part_of_it(tmp_path: Path) -> None:
     assert len(again.measurements_of(FIT)) == 3 and again.data(VALIDATION) is None
 
 
+def test_the_last_plan_of_the_fit_counts_until_a_validation_joins(tmp_path: Path) -> None:
+    journal, state = noted(tmp_path)
+    for name, count in (("abc-fit-1", 3), ("abc-fit-2", 4)):
+        journal.note_plan(name, plan_of(ROBOT, Q[:count] / 3.0))
+    stored = open_journal(tmp_path, ROBOT)
+    assert stored is not None and stored.fit_plan is not None and stored.fit_plan[0] == "abc-fit-2"
+    assert same_plan(stored.fit_plan[1], plan_of(ROBOT, Q[:4] / 3.0)) and len(stored.rows) == 3
+    journal.note(state, state.decided(NextStep(FIT, "", joins=True)))
+    stored = open_journal(tmp_path, ROBOT)
+    assert stored is not None and stored.fit_plan is None
+
+
 @pytest.mark.parametrize("torn", ['{"measured": 99, "role"', '{"measured": 99}', "\x00\x00", "{"])
 def test_a_torn_last_line_is_cut_off(tmp_path: Path, torn: str) -> None:
     journal, state = noted(tmp_path)
@@ -99,7 +113,8 @@ def test_a_new_campaign_leaves_the_old_journal_beside(tmp_path: Path) -> None:
     "line",
     ["[]", "nonsense", '{"measured": 1, "role": "fit", "configuration": [1], "points": [[0,0,0]]}',
      '{"measured": "x"}', '{"excluded": [1, 2, 3], "radius": 1, "reason": "", "asked": false}',
-     '{"measured": 1, "role": "fit", "configuration": [1e999, 0], "points": [[0,0,0]]}'],
+     '{"measured": 1, "role": "fit", "configuration": [1e999, 0], "points": [[0,0,0]]}',
+     '{"fit_plan": "x"}', '{"fit_plan": "x", "plan": {"robot": "planar_2r"}}', '{"fit_plan": "x", "plan": "{}"}'],
 )  # fmt: skip
 def test_damage_in_the_middle_is_refused_by_name(tmp_path: Path, line: str) -> None:
     journal, _ = noted(tmp_path)

@@ -146,6 +146,7 @@ def test_arguments_are_explained_and_used(path: Path, stand_ins: None) -> None:
         assert len(argument.named["description"]) > 8, name
         choices = argument.named.get("choices")
         assert choices is None or argument.named["default_value"] in choices, name
+        assert (choices == ["", "true", "false"]) == (name in ("autostart", "use_sim_time")), name
     mentioned = used(nodes)
     assert mentioned <= set(arguments)
     opaque = set(getattr(load(path), "KINDS", ()))

@@ -24,7 +24,7 @@ from rclpy.waitable import NumberOfEntities, Waitable
 from std_srvs.srv import Trigger
 
 from calib_planner.ros.messages import point_message
-from calib_planner.ros.qos import STREAM_IN
+from calib_planner.ros.qos import EVENTS
 from calib_planner.ros.rclpy_ext.lifecycle import TidyLifecycleNode, given_parameters
 from calib_planner.ros.rclpy_ext.run import spin_once
 
@@ -94,8 +94,8 @@ def test_polling_the_executor_hands_out_in_turns_not_by_the_stamps(bench: Bench)
     node, executor = other(bench)
     heard: list[int] = []
     for topic in ("a", "b"):
-        node.create_subscription(PointStamped, topic, lambda m: heard.append(m.header.stamp.nanosec), STREAM_IN)
-    a, b = (bench.client.create_publisher(PointStamped, topic, STREAM_IN) for topic in ("a", "b"))
+        node.create_subscription(PointStamped, topic, lambda m: heard.append(m.header.stamp.nanosec), EVENTS)
+    a, b = (bench.client.create_publisher(PointStamped, topic, EVENTS) for topic in ("a", "b"))
     bench.wait(lambda: a.get_subscription_count() and b.get_subscription_count())
     for stamp in range(20):
         (b if stamp == 10 else a).publish(point_message([1.0, 0, 0], stamp, ""))

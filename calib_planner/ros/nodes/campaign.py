@@ -6,6 +6,9 @@ the identifier's ``plan_topic``), sends the robot to one configuration at a time
 accepted. The identifier has to keep its measurements when a plan comes (``keep_measurements``): every plan of the
 fit holds everything that was measured before. The plan of the validation holds the validation only; after it the
 plan of the fit is announced again, so that in the end the identifier's own estimate, too, is that of the fit.
+When a validation joins the fit, the identifier has to take a plan of the fit that holds it before the next
+validation is announced. The journal keeps the plan of the fit that was taken, so that after a restart the same
+plan is announced again.
 
 The robot is sent nowhere before ``~/start``, nor after a restart before ``~/resume``. All callbacks take turns in
 one thread.
@@ -139,7 +142,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             self.get_logger().error(self._reason)
             return
         self._id, self._journal = stored.campaign_id, stored.journal
-        self._measuring.begin(self._id)
+        self._measuring.begin(self._id, stored.fit_plan)
         self._reason = f"{len(stored.rows)} measurements of campaign {self._id} are there: call ~/resume to go on"
 
     def _serve(self, action: Callable[[], str]) -> str:
@@ -216,15 +219,22 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         before = self.campaign
         if before is state:
             return
-        if self._journal is not None and before is not None:
-            try:
-                self._journal.note(before, state)
-            except StoreError as error:
-                self._journal = None
-                state = state.pause()
-                self._reason = f"paused: not stored any more, {error}; ~/resume goes on without storing"
-                self.get_logger().error(self._reason)
+        if before is not None and not self._stored(lambda journal: journal.note(before, state)):
+            state = state.pause()
         self.campaign = state
+
+    def _stored(self, write: Callable[[Journal], None]) -> bool:
+        """Write to the journal, if there is one; ``False`` if that failed: then there is none any more."""
+        if self._journal is None:
+            return True
+        try:
+            write(self._journal)
+        except StoreError as error:
+            self._journal = None
+            self._reason = f"paused: not stored any more, {error}; ~/resume goes on without storing"
+            self.get_logger().error(self._reason)
+            return False
+        return True
 
     def _tick(self) -> None:
         self._take_step()
@@ -236,7 +246,11 @@ class CampaignNode(ManagedNode[CampaignParameters]):
     def _go_on(self, state: CampaignState) -> None:
         action, measuring = state.action, self._measuring
         if isinstance(action, Measure):
+            before = measuring.fit
             self._set(measuring.step(state, action))
+            new = None if measuring.fit is before else measuring.fit
+            if new is not None and not self._stored(lambda journal: journal.note_plan(new.plan_id, new.plan)):
+                self._set(state.pause())
             if measuring.waited > self.settings.value.longest_wait:
                 self._pause_for(f"{measuring.waiting}; call ~/resume once that is remedied")
             return
@@ -258,6 +272,8 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             self._pause_for(reason_of(error))
             return
         self._set(self.campaign.decided(step))
+        if step.joins:
+            self._measuring.joined()
         self.get_logger().info(f"round {len(self.campaign.rounds)}: {step.message}")
 
     def _pause_for(self, reason: str) -> None:
@@ -278,7 +294,8 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         if message is not None:
             message.header.stamp = stamp_message(self.now)
             self._estimates.publish(message)
-        self._measuring.back_to_fit()
+        if self.campaign is not None:
+            self._measuring.back_to_fit(self.campaign)
         folder = self.settings.value.store_folder
         if folder:
             try:
