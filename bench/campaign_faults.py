@@ -14,17 +14,15 @@ of them makes the exit status 1.
     python bench/campaign_faults.py                     # everything: some hours; runs sleep most of the time
     python bench/campaign_faults.py --faults reseat_0.3mm none --seeds 3 --jobs 3
 
-Runs are on ROS domains of their own, which tests do not use; one that others have joined is made again
-elsewhere. All faults come with one seed before the next; Ctrl-C ends it with what is done. The table goes to
-stderr, JSON to stdout; ``--keep FOLDER`` keeps logs and stores.
+Each run is on a ROS domain of its own; one that others have joined all the same is made again elsewhere. All
+faults come with one seed before the next; Ctrl-C ends it with what is done. The table goes to stderr, JSON to
+stdout; ``--keep FOLDER`` keeps logs and stores.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import queue
 import sqlite3
 import sys
 import tempfile
@@ -45,7 +43,7 @@ from calib_planner.errors import CalibPlannerError
 from calib_planner.io import read_measurements
 from calib_planner.ros.demo import DemoClient
 from calib_planner.ros.messages import estimate_from_message
-from calib_planner.ros.processes import Nodes
+from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.ros.qos import LATCHED
 from calib_planner.simulation import Faults, random_deviations
 
@@ -60,8 +58,6 @@ EXPECTED = {"calibration_identifier", "tracker_simulator", NAME}
 MEASUREMENTS, SPAN = 16, 20.0
 """About what a campaign without faults takes; faults that begin do so half-way, the span is for drifts [s]."""
 HALF = MEASUREMENTS // 2
-DOMAINS = range(215, 233)
-"""Above the ports that the system gives away."""
 BAD = ("wrong", "lost", "crash", "hung")
 ENDS = ("PASS", "WARN", "FAIL", *BAD)
 S = CampaignStatus
@@ -215,7 +211,6 @@ def run(fault: str, seed: int, domain: int, folder: Path) -> Run:
     with Nodes(folder / "log", domain) as nodes:
         desk = Desk(domain, nodes.check)
         try:
-            desk.wait(lambda: False, 1.0)  # for others to be seen
             for name in NODES:
                 nodes.start(name, parameters[name])
             found = Run(fault, seed, "")
@@ -328,24 +323,18 @@ def lost(desk: Desk, folder: Path, last: CampaignStatus) -> list[str]:
 
 def runs(names: Sequence[str], seeds: Sequence[int], jobs: int, keep: Path | None) -> dict[str, list[Run]]:
     """All of them, ``jobs`` at a time, each on a domain of its own."""
-    domains: queue.Queue[int] = queue.Queue()
-    for k in range(len(DOMAINS)):
-        domains.put(DOMAINS[(os.getpid() + k) % len(DOMAINS)])
 
     def one(fault: str, seed: int) -> Run:
         for attempt in range(8):
-            domain = domains.get()
             try:
-                with tempfile.TemporaryDirectory(prefix="campaign_faults_") as name:
+                with own_domain() as domain, tempfile.TemporaryDirectory(prefix="campaign_faults_") as name:
                     where = Path(name) if keep is None else keep / f"{fault}_{seed}_{attempt}"
                     return run(fault, seed, domain, where)
             except Disturbed:
                 continue
             except Exception as error:
                 return Run(fault, seed, "crash", why=f"{type(error).__name__}: {error}"[:1500])
-            finally:
-                domains.put(domain)
-        return Run(fault, seed, "hung", why="every ROS domain is in use")
+        return Run(fault, seed, "hung", why="others joined every ROS domain that was tried")
 
     done: dict[str, list[Run]] = {name: [] for name in names}
     with ThreadPoolExecutor(jobs) as pool:
