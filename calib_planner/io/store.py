@@ -203,6 +203,11 @@ LATEST = """
     WHERE d.number IN (SELECT MAX(number) FROM decisions WHERE campaign = ? GROUP BY standstill)
     ORDER BY d.standstill
 """
+WITHDRAW = """
+    INSERT INTO decisions (campaign, standstill, status, reason, configuration, repetition, unused, at)
+    SELECT campaign, standstill, ?, ?, configuration, repetition, '[]', ? FROM decisions
+    WHERE number IN (SELECT MAX(number) FROM decisions WHERE standstill = ? GROUP BY campaign)
+"""
 
 
 @dataclass(frozen=True)
@@ -349,6 +354,15 @@ class SessionStore:
             with self._writing() as write:
                 for record in records:
                     _decide(write, session, record.number, record)
+
+    def withdraw(self, record: Record) -> None:
+        """Write that a standstill is not used any more, in every session that has it.
+
+        Raises:
+            StoreError: It cannot be written; nothing was.
+        """
+        with self._writing() as write:
+            write.execute(WITHDRAW, (record.status, record.reason[:LONGEST], _now(), record.number))
 
     def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Record]) -> StoredSession:
         with self._writing() as write:

@@ -213,13 +213,14 @@ class Session:
         return None if last is None else self.withdraw(last, UNDONE, "withdrawn on request")
 
     def withdraw(self, record: Record, status: str, reason: str) -> Record:
-        """Use one of ``records`` no more.
+        """Use one of ``records`` no more, under this plan or under another that it was measured for.
 
         Raises:
             StoreError: That cannot be stored; nothing was changed.
         """
         gone = record.now(status, reason)
-        self.store.decide(self._ensure_begun(), [gone])
+        self._ensure_begun()
+        self.store.withdraw(gone)
         self.records.remove(record)
         self._unsaved.pop(record.number, None)
         self._others[status] += 1

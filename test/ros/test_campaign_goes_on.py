@@ -186,6 +186,22 @@ def test_a_new_plan_can_go_on_with_the_measurements() -> None:
     assert [d.index for d in again.records] == [d.index for d in campaign.records]
 
 
+def test_a_measurement_that_is_undone_does_not_come_back_with_a_plan() -> None:
+    """It is undone under every plan that it was carried to, and the others are in use as before."""
+    session = begun(opened(""))
+    measure(session, *(seen(k) for k in range(6)))
+    assert session.begin("other", planned(4, seed=5), 0.01, keep=True) and len(session.records) == 6
+    measure(session, seen(0, plan=planned(4, seed=5)))
+    number = session.records[2].number
+    assert session.undo(number) is not None
+    assert session.begin("p", PLAN, 0.01, keep=True)
+    assert [r.index for r in session.records] == [0, 1, 3, 4, 5] and session.rejections == {"undone": 1}
+    again = begun(session.store, None)
+    assert [r.index for r in again.records] == [0, 1, 3, 4, 5] and 2 in again.missing()
+    statuses = [d["status"] for d in session.store.history(number)]
+    assert sorted(statuses) == ["accepted", "accepted", "undone", "undone"]
+
+
 def test_reset_leaves_the_old_campaign_in_the_store() -> None:
     campaign = begun(opened(""))
     measure(campaign, seen(0), seen(1))
