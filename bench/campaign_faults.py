@@ -43,8 +43,8 @@ from calib_planner.errors import CalibPlannerError
 from calib_planner.io import read_measurements
 from calib_planner.ros.demo import DemoClient
 from calib_planner.ros.messages import estimate_from_message
+from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
-from calib_planner.ros.qos import LATCHED
 from calib_planner.simulation import Faults, random_deviations
 
 ROBOT = "kuka_kr270"

@@ -52,8 +52,8 @@ from calib_planner.io import open_store
 from calib_planner.planning import Search
 from calib_planner.ros.messages import stamp_message
 from calib_planner.ros.model import first_model
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
-from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.ros.session import Matching, Session
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.simulation import random_deviations

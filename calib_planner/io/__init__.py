@@ -26,17 +26,18 @@ if TYPE_CHECKING:
     from calib_planner.io.error_model import read_error_model, typical, write_error_model
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
     from calib_planner.io.kinematics import read_kinematics, write_kinematics
-    from calib_planner.io.plan import read_plan, write_plan
-    from calib_planner.io.prior import read_prior
-    from calib_planner.io.sheet import (
+    from calib_planner.io.plan import (
         SHARE,
         SHEET_FILES,
         WORDS,
+        read_plan,
         robot_pace,
+        write_plan,
         write_sheet_csv,
         write_sheet_yaml,
         write_trajectory,
     )
+    from calib_planner.io.prior import read_prior
     from calib_planner.io.sources import Sources, SourceSettings, read_source, read_sources
     from calib_planner.io.store import (
         ACCEPTED,
@@ -79,9 +80,9 @@ else:
             "error_model": "read_error_model typical write_error_model",
             "estimate": "calibrated_robot placement read_estimate write_estimate",
             "kinematics": "read_kinematics write_kinematics",
-            "plan": "read_plan write_plan",
+            "plan": "SHARE SHEET_FILES WORDS read_plan robot_pace write_plan write_sheet_csv write_sheet_yaml "
+            "write_trajectory",
             "prior": "read_prior",
-            "sheet": "SHARE SHEET_FILES WORDS robot_pace write_sheet_csv write_sheet_yaml write_trajectory",
             "sources": "Sources SourceSettings read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
             "SessionStore Journal Record StoredSession StoredModel UnavailableStore begin_journal "

@@ -3,7 +3,7 @@
 ``render`` is the one template engine, also for other packages. docs/glossary.md explains the words.
 """
 
+from calib_planner.report.calibration import InputFile, Provenance, provenance
 from calib_planner.report.page import write_report
 from calib_planner.report.plan_sheet import write_sheet, write_sheet_page
-from calib_planner.report.provenance import InputFile, Provenance, provenance
 from calib_planner.report.render import render

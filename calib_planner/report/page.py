@@ -17,8 +17,7 @@ from markupsafe import Markup
 from calib_planner.identification import SIGNIFICANT, STRONG, Estimate, IdentificationProblem
 from calib_planner.io import URDF_SUFFIXES, write_text
 from calib_planner.report import charts
-from calib_planner.report.calibration import CalibrationReport, calibration_report
-from calib_planner.report.provenance import Provenance
+from calib_planner.report.calibration import CalibrationReport, Provenance, calibration_report
 from calib_planner.report.render import TEMPLATES, embedded, render
 from calib_planner.report.scene import still_picture
 from calib_planner.robot import is_nuisance

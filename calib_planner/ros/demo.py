@@ -38,8 +38,8 @@ from calib_planner.errors import CalibPlannerError, InfeasibleError
 from calib_planner.planning import PlanProblem
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import estimate_from_message, plan_from_message
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
-from calib_planner.ros.qos import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 from calib_planner.units import length
 

@@ -37,8 +37,7 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
-from calib_planner.ros.parameters import QOS, NodeParameters, parameter
-from calib_planner.ros.qos import REQUESTS, overridable, own
+from calib_planner.ros.parameters import QOS, REQUESTS, NodeParameters, overridable, own, parameter
 from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
 from calib_planner.ros.rclpy_ext.lifecycle import TidyLifecycleNode, given_parameters
 from calib_planner.units import cut

@@ -25,7 +25,7 @@ from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_t
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.qos import LATCHED
+from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.settings import IdentifierParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
 

@@ -4,10 +4,17 @@ Each field is a parameter. It is made with ``parameter`` or, in a class of setti
 ``arrays.ranged``; what the library declares is taken by the transition ``configure``. ``NodeParameters`` declares
 the parameters, refuses a name that is unknown and a value of another type or out of range, says why, and holds
 the current values as one immutable object. ROS itself drops unknown names given at start without a word.
+
+*Qualities of service.* Every publisher and subscription of the nodes takes parameters like
+
+    qos_overrides./tracker/point.subscription.reliability: best_effort
+
+(full topic name; reliability, durability, history, depth). They are read when the node is configured.
 """
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Sequence
@@ -22,6 +29,8 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.ros.rclpy_ext.lifecycle import given_parameters
@@ -31,7 +40,7 @@ P = TypeVar("P")
 
 BUILT_IN = ("use_sim_time", "start_type_description_service")
 QOS = "qos_overrides."
-"""rclpy declares parameters that begin so when the topic is created; see ``qos``."""
+"""rclpy declares parameters that begin so when the topic is created."""
 LONGEST_TEXT, LONGEST_LIST = 4096, 1000
 """Characters of a text and items of a list, at most: a parameter is no place for data."""
 TYPES = {
@@ -201,3 +210,49 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
     """Sequences from ROS as tuples."""
     scalar = (str, int, float, bool)
     return {k: v if isinstance(v, scalar) else tuple(v) for k, v in values.items()}
+
+
+# ── qualities of service ─────────────────────────────────────────────────────────────────────────────
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Results: a subscriber that comes late gets the newest."""
+
+EVENTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+"""Measurements, of which none may be lost."""
+
+SENSOR_OUT = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+"""Streams that the nodes publish."""
+
+SENSOR_IN = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Streams that the nodes subscribe to: best effort matches every publisher, reliable or not."""
+
+STREAM_IN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""The same where few may be lost: the queue holds five seconds at 1 kHz."""
+
+REQUESTS = QoSProfile(depth=100)
+"""Requests: rclpy's depth of 10 loses some of a burst, whose clients then wait for ever."""
+
+DEEPEST = 100_000
+"""Largest depth of a queue in an override."""
+
+POLICIES = (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY, QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH)
+
+
+def overridable(entity_id: str | None = None) -> QoSOverridingOptions:
+    """The option that makes a publisher or subscription take overrides.
+
+    Args:
+        entity_id: Tells two publishers or subscriptions of one topic in one node apart.
+    """
+    return QoSOverridingOptions(POLICIES, callback=_check_depth, entity_id=entity_id)
+
+
+def own(qos: QoSProfile | int) -> QoSProfile:
+    """A copy, since rclpy writes overrides into the profile that it gets."""
+    return QoSProfile(depth=qos) if isinstance(qos, int) else copy.copy(qos)
+
+
+def _check_depth(profile: QoSProfile) -> SetParametersResult:
+    if not 1 <= profile.depth <= DEEPEST:
+        return SetParametersResult(successful=False, reason=f"depth {profile.depth}, valid is 1 to {DEEPEST}")
+    return SetParametersResult(successful=True)

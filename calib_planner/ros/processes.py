@@ -1,12 +1,19 @@
 """Nodes as processes, on a ROS domain that nobody else uses.
 
-They are ended when ``Nodes`` is left, and end with this process even if it is killed: see ``child``.
+``Nodes`` ends them when it is left. They also end with the process that started them, even if that is killed:
+
+    python -m calib_planner.ros.processes NAME_node …
+
+runs a node and watches standard input, whose other end the process that started it holds and never writes to.
+When that process ends, the system closes that end: then the node is told to end, as Ctrl-C would tell it, and a
+node that does not end in time is ended.
 """
 
 from __future__ import annotations
 
 import itertools
 import os
+import runpy
 import signal
 import socket
 import subprocess
@@ -22,7 +29,7 @@ from types import TracebackType
 from calib_planner.errors import CalibPlannerError
 
 PATIENCE = 8.0
-"""Time that a process has to end after SIGINT before it is killed [s]."""
+"""Time that a node has to end by itself before it is killed [s]."""
 LAST_WORDS = 2.0
 """Time that it then has to write to its log what it was doing [s]."""
 DOMAINS = 100
@@ -105,7 +112,7 @@ class Nodes:
 
     def start(self, module: str, parameters: Mapping[str, object] | None = None) -> None:
         """Start a node by the name of its executable (``planner_node`` …), with node parameters."""
-        command = [sys.executable, "-m", "calib_planner.ros.child", module, "--ros-args"]
+        command = [sys.executable, "-m", "calib_planner.ros.processes", module, "--ros-args"]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={value}"]
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -201,3 +208,32 @@ def _undisturbed() -> Iterator[None]:
 def node_names() -> Sequence[str]:
     """Executables of all nodes of this package."""
     return ("planner_node", "identifier_node", "simulator_node", "campaign_node")
+
+
+# ── inside the process of a node ─────────────────────────────────────────────────────────────────────
+
+
+def end_with_parent() -> None:
+    """Watch standard input from now on."""
+    threading.Thread(target=_watch, daemon=True, name="parent").start()
+
+
+def _watch() -> None:
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(PATIENCE)
+    os._exit(1)
+
+
+def main() -> None:
+    """Run the node of the executable ``NAME_node`` (``nodes/NAME.py``) with what follows on the command line."""
+    if len(sys.argv) < 2 or not sys.argv[1].isidentifier():
+        raise SystemExit("usage: python -m calib_planner.ros.processes NAME_node [--ros-args …]")
+    end_with_parent()
+    node = sys.argv.pop(1).removesuffix("_node")
+    runpy.run_module(f"calib_planner.ros.nodes.{node}", run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,11 +6,11 @@ docs/glossary.md explains the words.
 from calib_planner.simulation.cell import (
     ANGLE_ERROR,
     LENGTH_ERROR,
+    Faults,
     SimulatedCell,
     independent_seeds,
     random_deviations,
 )
-from calib_planner.simulation.faults import Faults
 from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour, make_tour
 from calib_planner.simulation.streams import Message, Rates, Streams, play
 from calib_planner.simulation.world import World, simulate_campaign, simulated

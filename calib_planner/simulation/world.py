@@ -29,6 +29,8 @@ from calib_planner.campaign import (
 from calib_planner.identification import JointCorrections, phases
 from calib_planner.robot import Robot
 from calib_planner.simulation.cell import (
+    NEVER,
+    Faults,
     Purpose,
     SimulatedCell,
     directions,
@@ -36,7 +38,6 @@ from calib_planner.simulation.cell import (
     independent_seeds,
     random_deviations,
 )
-from calib_planner.simulation.faults import NEVER, Faults
 from calib_planner.simulation.motion import Stand
 from calib_planner.tracker import LaserTracker, Noise
 

@@ -11,8 +11,7 @@ from rich.table import Table
 from calib_planner.cli import Commands, Terminal, add_command, add_seed
 from calib_planner.io import make_folder
 from calib_planner_paper import printed
-from calib_planner_paper.page import micrometres, publish
-from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, reproduce
+from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, micrometres, publish, reproduce
 
 DESCRIPTION = """Compute Tables 1 and 2 and Figs 2, 3 and 5 of the paper again, beside what it prints.
 Leaves tables.json (lengths [m], angles [rad], variances of Table 1 over σ²), the figures as PNG and SVG, and a

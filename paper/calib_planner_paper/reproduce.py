@@ -1,17 +1,48 @@
-"""All tables and figures in one run: settings → ``reproduce`` → numbers."""
+"""All tables and figures in one run: settings → ``reproduce`` → numbers → ``publish`` → files.
+
+The files are ``tables.json``, the figures as PNG and SVG, and the page ``index.html``, which shows the paper's
+numbers beside those computed here, and says what agrees and what cannot be compared. The page's words are in the
+template ``reproduction.html``; every number comes from the result, whatever its seed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from base64 import b64encode
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from calib_planner import __version__
 from calib_planner.arrays import check_count, plain
+from calib_planner.errors import InputError
+from calib_planner.io import make_folder, write_text
+from calib_planner.report import render
+from calib_planner.units import signed
 from calib_planner_paper import printed
-from calib_planner_paper.kuka import ROBOT, SIGMA, TEST_POSES, WORKSPACE, Figure5, Table2, figure_5, table_2
+from calib_planner_paper.drawing import draw_figure_5, draw_two_link_figure, png, svg
+from calib_planner_paper.kuka import (
+    DRAWN,
+    ROBOT,
+    SEPARATE,
+    SIGMA,
+    TEST_POSES,
+    WORKSPACE,
+    Figure5,
+    Rows,
+    Table2,
+    figure_5,
+    scaled,
+    table_2,
+)
 from calib_planner_paper.two_link import FIGURE_2, FIGURE_3, Table1, TwoLinkFigure, table_1, two_link_figure
 
 Update = Callable[[float, str], None]
+TEMPLATE = Path(__file__).parent / "reproduction.html"
+PLANS = {"a": "a, poor", "b": "b, D-optimal", "c": "c, for the test pose"}
 
 
 @dataclass(frozen=True)
@@ -95,3 +126,238 @@ def reproduce(settings: ReproductionSettings, update: Update = lambda share, tex
     update(0.85, "Fig. 5")
     last = figure_5(tables[0], count, seed)
     return Reproduction(settings, first, second, third, tuple(tables), last)
+
+
+# ── the files ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def publish(result: Reproduction, folder: str | Path) -> None:
+    """Write all files to ``folder``, made if need be. Same result, same bytes.
+
+    Raises:
+        InputError: The folder cannot be made or written.
+    """
+    target = make_folder(folder)
+    drawn = {
+        "figure_2": [draw_two_link_figure(result.figure_2, narrow=n) for n in (False, True)],
+        "figure_3": [draw_two_link_figure(result.figure_3, narrow=n) for n in (False, True)],
+        "figure_5": [draw_figure_5(result.figure_5, narrow=n) for n in (False, True)],
+    }
+    pictures = {name: (svg(wide), svg(narrow)) for name, (wide, narrow) in drawn.items()}
+    for name, (wide, _) in drawn.items():
+        try:
+            (target / f"{name}.svg").write_bytes(pictures[name][0])
+            (target / f"{name}.png").write_bytes(png(wide))
+        except OSError as error:
+            got = f"{target} ({error.strerror or error})"
+            raise InputError("output", got, "a folder that can be written", "choose another") from None
+    text = json.dumps(result.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
+    write_text(target / "tables.json", text + "\n")
+    write_text(target / "index.html", page(result, pictures))
+
+
+def page(result: Reproduction, pictures: dict[str, tuple[bytes, bytes]]) -> str:
+    """The page as HTML text; ``pictures``: figure → SVG for wide screens and paper, SVG for phones."""
+    images = {
+        name: [f"data:image/svg+xml;base64,{b64encode(image).decode()}" for image in pair]
+        for name, pair in pictures.items()
+    }
+    return render(
+        TEMPLATE,
+        version=__version__,
+        settings=result.settings,
+        random=f"{result.settings.random_plans:,}".replace(",", " "),
+        images=images,
+        drawn=DRAWN,
+        columns=result.table_1.columns,
+        table_1=_table_1(result.table_1),
+        two_link={2: _two_link(result.figure_2), 3: _two_link(result.figure_3)},
+        **_table_2(result.table_2),
+        **_figure_5(result.figure_5),
+    )
+
+
+class Table(NamedTuple):
+    """A table: caption, names of the columns, rows of texts."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Row]
+
+
+class Row(NamedTuple):
+    """Texts, left to right; ``ours``: computed here; ``wrong``: columns that contradict the rest of the print."""
+
+    cells: Sequence[str]
+    ours: bool = False
+    wrong: Sequence[int] = ()
+
+
+def micrometres(metres: float) -> str:
+    """A length in µm as ``number`` writes it, without the unit."""
+    return number(1e6 * metres)
+
+
+def number(value: float) -> str:
+    """Three significant digits, all digits from 1000 on, powers of ten from a hundred thousand on."""
+    if not np.isfinite(value):
+        return "∞"
+    if value < 999.5:
+        return f"{value:#.3g}".rstrip(".")
+    if value < 99_999.5:
+        return f"{value:.0f}"
+    digits, exponent = f"{value:.2e}".split("e")
+    superscript = str(int(exponent)).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{float(digits):g}·10{superscript}"
+
+
+# ── the two-link arm ─────────────────────────────────────────────────────────────────────────────────
+
+
+def _table_1(result: Table1) -> Table:
+    columns = result.columns
+    wrong = [i for i, c in enumerate(columns, 1) if c.misprinted]
+    rows = [
+        Row(("ρ0²/σ², paper", *(f"{c.printed:g}" for c in columns)), wrong=wrong),
+        Row(("by (20)", *(f"{c.closed_form:.3f}" for c in columns)), ours=True),
+        Row(("planner's plan, (14)", *(f"{c.planned:.3f}" for c in columns)), ours=True),
+        Row(("lower bound", *(f"{c.lower_bound:.3f}" for c in columns)), ours=True),
+        Row(("ρD²/σ², D-optimal plan", *(f"{c.d_optimal:.3f}" for c in columns)), ours=True),
+        Row(("ρD/ρ0 − 1, paper", *(f"{100 * c.printed_gain:.0f} %" for c in columns)), wrong=wrong),
+        Row(("ρD/ρ0 − 1, here", *(f"{100 * c.gain:.1f} %" for c in columns)), ours=True),
+    ]
+    return Table("", ("q20", *(c.angle for c in columns)), rows)
+
+
+def _two_link(result: TwoLinkFigure) -> dict[str, Any]:
+    """What the template shows of Fig. 2 or 3."""
+    plans = [
+        Row(
+            (
+                PLANS[p.label],
+                ", ".join(f"{signed(angle, 0)}°" for angle in angles),
+                f"{1e3 * p.expected:.3f}",
+                f"{1e3 * p.simulated:.3f} ± {1e3 * p.standard_error:.3f}",
+            ),
+            ours=True,
+        )
+        for p, angles in zip(result.plans, result.settings.angles, strict=True)
+    ]
+    gains = [
+        Row(
+            (
+                f"c over {g.over}",
+                f"{100 * g.printed:.0f} %",
+                f"{100 * g.expected:.1f} %",
+                f"{signed(100 * g.simulated, 0)} ± {100 * g.standard_error:.0f} %",
+            )
+        )
+        for g in result.gains()
+    ]
+    return {
+        "plans": Table("ρ0 [mm]; q1 = 0; ± standard error", ("plan", "q2", "by (14)", "simulated"), plans),
+        "gains": Table("Gain 1 − ρc/ρ", ("", "paper", "by (14)", "simulated"), gains),
+        "gain": [f"{100 * g.expected:.1f}" for g in result.gains()],
+        "planned": f"{1e3 * result.planned:.3f}",
+        "bound": f"{1e3 * result.lower_bound:.3f}",
+        "c": f"{1e3 * result.plans[2].expected:.3f}",
+    }
+
+
+# ── the KUKA KR 270 ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _table_2(tables: Sequence[Table2]) -> dict[str, Any]:
+    """What the template shows of Table 2: choices, tables, numbers in the text."""
+    first, unmeasurable = tables[0], tables[-1]
+    rows, twelve = first.rows(), printed.LABELS.index("12")
+    box = zip("xyz", np.asarray(WORKSPACE.low), np.asarray(WORKSPACE.high), strict=True)
+    paper, here = (micrometres(r["proposed"][twelve]) for r in (printed.TABLE_2, rows))
+    title = f"The same over each one's own proposed plan of 12 (paper {paper} µm, here {here} µm)"
+    shown = ("random, mean", "random, median", "proposed", "lower bound")
+    poses = [(t.pose.name, ", ".join(f"{signed(a, 0)}°" for a in t.pose.degrees), t.pose.why) for t in tables]
+    others = [
+        Row((name, t.pose.name, *map(micrometres, t.rows()[name])), ours=True)
+        for t in tables[1:]
+        for name in shown
+    ]
+    header = ("", "", *printed.LABELS)
+    return {
+        "workspace": ", ".join(f"{n} {signed(a, 1)} … {signed(b, 1)} m" for n, a, b in box),
+        "poses": poses,
+        "bounds_kuka": sorted({plan.quality.bound for one in tables for plan in one.plans.values()}),
+        "tables_2": [
+            Table("ρ0 [µm] at test pose A, by number of experiments", header,
+                  _pairs(printed.TABLE_2, rows, micrometres)),
+            Table(title, header, _pairs(scaled(printed.TABLE_2), scaled(rows), number)),
+            Table("Other test poses, ρ0 [µm]", header, others),
+        ],
+        "normalised": [
+            ", ".join(f"{_normalised(row, m):.2f}" for m in SEPARATE)
+            for row in (rows["proposed"], printed.TABLE_2["proposed"])
+        ],
+        "here": _compared(scaled(rows)),
+        "paper": _compared(scaled(printed.TABLE_2)),
+        "at_c": _compared(unmeasurable.scaled()),
+        "at_pose": micrometres(SIGMA * (3 / 12) ** 0.5),
+        "spread": ", ".join(f"{_normalised(t.rows()['proposed'], 12):.2f} ({t.pose.name})" for t in tables),
+        "tail": {m: f"{first.tail(m):.1f}" for m in SEPARATE},
+        "elsewhere": ", ".join(micrometres(first.plans[m].quality.general_accuracy) for m in SEPARATE),
+        "contradictions": [
+            (d.row, d.column, micrometres(d.printed), micrometres(d.implied)) for d in printed.contradictions()
+        ],
+    }  # fmt: skip
+
+
+def _pairs(paper: Rows, here: Rows, write: Callable[[float], str]) -> list[Row]:
+    """Each row of the paper above ours; rows that the paper does not have alone."""
+    wrong = {(d.row, d.column) for d in printed.contradictions()}
+    rows = []
+    for name, values in here.items():
+        if name in paper:
+            columns = [i for i, label in enumerate(printed.LABELS, 2) if (name, label) in wrong]
+            rows.append(Row((name, "paper", *map(write, paper[name])), wrong=columns))
+        rows.append(Row(("" if name in paper else name, "here", *map(write, values)), ours=True))
+    return rows
+
+
+def _normalised(row: tuple[float, ...], m: int) -> float:
+    """m·ρ0²/σ²."""
+    return m * (row[printed.SIZES.index((m, 1))] / SIGMA) ** 2
+
+
+def _compared(rows: Rows) -> dict[str, str]:
+    """Numbers of the text on rows over their proposed plan of 12: what repeating costs [%], and random plans."""
+    column = {label: {name: values[i] for name, values in rows.items()} for i, label in enumerate(printed.LABELS)}
+    return {
+        "few": signed(100 * (column["3×4"]["proposed"] - 1), 1),
+        "four": signed(100 * (column["4×3"]["proposed"] - 1), 1),
+        "min_12": number(column["12"]["random, min"]),
+        "mean_12": number(column["12"]["random, mean"]),
+        "mean_4": f"{column['4']['random, mean'] / column['4']['proposed']:.1f}",
+    }
+
+
+def _figure_5(result: Figure5) -> dict[str, Any]:
+    """What the template shows of Fig. 5."""
+    twelve = result.plans[-1]
+    rows = [
+        Row(
+            (
+                p.label.replace("random", "12 random"),
+                f"{1e6 * printed.FIGURE_5[p.label]:.1f}",
+                f"{printed.FIGURE_5[p.label] / printed.FIGURE_5['12']:.2f}",
+                f"{1e6 * p.expected:.1f}",
+                f"{p.expected / twelve.expected:.2f}",
+                f"{1e6 * p.simulated:.1f} ± {1e6 * p.standard_error:.1f}",
+            )
+        )
+        for p in result.plans
+    ]
+    header = ("plan", "paper", "over its 12", "by (14)", "over our 12", "simulated")
+    return {
+        "plans_5": Table("Expected ρ0 [µm]; ± standard error", header, rows),
+        "gain_5": signed(100 * result.gain, 0),
+        "worst_5": f"{max(abs(p.simulated - p.expected) / p.standard_error for p in result.plans):.1f}",
+        "error_5": f"{100 * twelve.standard_error / twelve.expected:.0f}",
+    }

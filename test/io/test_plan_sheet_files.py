@@ -18,7 +18,7 @@ from calib_planner.arrays import plain
 from calib_planner.errors import InputError
 from calib_planner.io import parse_urdf, read_plan_csv, write_sheet_csv, write_sheet_yaml
 from calib_planner.io.csv import read_table
-from calib_planner.io.sheet import sheet_csv
+from calib_planner.io.plan import sheet_csv
 from calib_planner.planning import PlanSheet, TrackerRange, plan_sheet
 
 ANGLES = st.floats(-7, 7, allow_subnormal=True)

@@ -12,7 +12,7 @@ from robots import mixed, plan_of, random_configurations
 from calib_planner import Robot
 from calib_planner.errors import InfeasibleError
 from calib_planner.io import write_trajectory
-from calib_planner.io.sheet import NANO, trajectory_text
+from calib_planner.io.plan import NANO, trajectory_text
 from calib_planner.planning import Pace, plan_sheet
 
 POINT = ["positions", "velocities", "accelerations", "effort", "time_from_start"]

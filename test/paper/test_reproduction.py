@@ -18,8 +18,7 @@ import pytest
 from calib_planner import Robot
 from calib_planner.cli import main
 from calib_planner_paper import printed
-from calib_planner_paper.page import number, publish
-from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, reproduce
+from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, number, publish, reproduce
 from calib_planner_paper.two_link import FIGURE_2, two_link_figure
 
 SETTINGS = ReproductionSettings(random_plans=2000, calibrations=100, seed=1)

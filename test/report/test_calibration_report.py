@@ -19,10 +19,9 @@ from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io import read_measurements
 from calib_planner.report import provenance, write_report
-from calib_planner.report.calibration import calibration_report
+from calib_planner.report.calibration import calibration_report, sha256_of
 from calib_planner.report.charts import MOST_DOTS, drawn_points, joint_residuals
 from calib_planner.report.page import report_page
-from calib_planner.report.provenance import sha256_of
 from calib_planner.report.scene import MOST_ROBOTS, REJECTED, thinned
 from calib_planner.simulation import random_deviations
 

@@ -9,7 +9,7 @@ from calib_planner_msgs.msg import CampaignStatus
 from std_srvs.srv import Trigger
 
 from calib_planner.ros.nodes.campaign import CampaignNode
-from calib_planner.ros.qos import LATCHED
+from calib_planner.ros.parameters import LATCHED
 
 NAME = "calibration_campaign"
 ASKED = {

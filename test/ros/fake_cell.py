@@ -20,7 +20,7 @@ from rclpy.node import Node
 
 from calib_planner import Robot
 from calib_planner.ros.messages import plan_from_message
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.lasting import LastingActionServer
 from calib_planner.simulation import SimulatedCell, random_deviations
 

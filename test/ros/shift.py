@@ -18,7 +18,7 @@ from calib_planner import Plan, Robot
 from calib_planner.acquisition import NANO
 from calib_planner.ros.messages import plan_to_message, point_message, stamp_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
-from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_OUT
+from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_OUT
 from calib_planner.simulation import random_deviations
 
 NAME = "calibration_identifier"

@@ -18,7 +18,7 @@ from calib_planner.ros import campaign as campaign_measuring
 from calib_planner.ros.nodes import campaign as campaign_node
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 
 IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
 SIMULATOR = {"robot": "planar_2r", "joint_speed": 50.0, "dwell": 0.7, "seed": 3}

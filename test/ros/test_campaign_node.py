@@ -28,7 +28,7 @@ from calib_planner.ros.nodes import campaign as campaign_node
 from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 
 IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}

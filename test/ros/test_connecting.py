@@ -30,7 +30,7 @@ from calib_planner import Robot
 from calib_planner.acquisition import NANO
 from calib_planner.io import config_folder
 from calib_planner.ros.messages import nanoseconds, plan_to_message
-from calib_planner.ros.qos import SENSOR_IN
+from calib_planner.ros.parameters import SENSOR_IN
 from calib_planner.ros.settings import SimulatorParameters
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "connecting.md").read_text()

@@ -32,7 +32,7 @@ from calib_planner.errors import InputError
 from calib_planner.io.store import JOURNAL as FILE
 from calib_planner.io.store import JOURNAL_FORMAT as FORMAT
 from calib_planner.ros.nodes.campaign import CampaignNode
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 
 IDENTIFIER = "calibration_identifier"
 NAN, INF = float("nan"), float("inf")

@@ -36,7 +36,7 @@ from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.planner import PlannerNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_OUT
+from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_OUT
 
 PLANNER, IDENTIFIER, SIMULATOR = "calibration_planner", "calibration_identifier", "tracker_simulator"
 PATHS = (

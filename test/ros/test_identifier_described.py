@@ -20,7 +20,7 @@ from calib_planner.io import parse_urdf
 from calib_planner.planning import Search
 from calib_planner.ros.messages import point_message, stamp_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
-from calib_planner.ros.qos import LATCHED
+from calib_planner.ros.parameters import LATCHED
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from calib_planner.acquisition import NANO
 from calib_planner.io import ACCEPTED, open_store, stored_model
 from calib_planner.io.store import FILE
 from calib_planner.ros.messages import joints_message, plan_to_message, point_message
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 
 NAME = "calibration_identifier"

@@ -23,7 +23,7 @@ from calib_planner.io.store import FILE
 from calib_planner.planning import Search
 from calib_planner.ros.messages import plan_to_message, point_message, stamp_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 
 
 @pytest.fixture(scope="module")

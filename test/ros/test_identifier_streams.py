@@ -16,7 +16,7 @@ from test_identifier_node import Shift, change, spread
 from calib_planner import Plan, Robot
 from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
-from calib_planner.ros.qos import EVENTS
+from calib_planner.ros.parameters import EVENTS
 
 CLOCK, FRAME = Measurement.REJECTED_CLOCK_OFFSET, Measurement.REJECTED_OTHER_FRAME
 

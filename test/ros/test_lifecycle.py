@@ -24,8 +24,7 @@ from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.planner import PlannerNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.parameters import parameter
-from calib_planner.ros.qos import EVENTS, LATCHED, SENSOR_IN
+from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_IN, parameter
 
 
 @dataclass(frozen=True)

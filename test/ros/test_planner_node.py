@@ -25,7 +25,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_planner.errors import InputError
 from calib_planner.ros.model import Model
 from calib_planner.ros.nodes.planner import PlannerNode
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 
 SERVICE, ACTION = "calibration_planner/request_plan", "calibration_planner/plan"
 POSE = [0.3, 0.5]

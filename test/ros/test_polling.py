@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from calib_planner.acquisition import NANO
 from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
 from calib_planner.ros.messages import nanoseconds, point_message
-from calib_planner.ros.qos import STREAM_IN
+from calib_planner.ros.parameters import STREAM_IN
 from calib_planner.ros.rclpy_ext.polling import EVENTS_EVERY, MOST_AT_ONCE, Stream, StreamPoller
 
 DEEP = QoSProfile(depth=4000, reliability=ReliabilityPolicy.RELIABLE)

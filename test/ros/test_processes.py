@@ -98,7 +98,7 @@ def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
 
 
 def test_a_module_that_is_none_is_refused() -> None:
-    command = [sys.executable, "-m", "calib_planner.ros.child", "../planner_node"]
+    command = [sys.executable, "-m", "calib_planner.ros.processes", "../planner_node"]
     ended = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert ended.returncode == 1 and "usage" in ended.stderr and "Traceback" not in ended.stderr
 

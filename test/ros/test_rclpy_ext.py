@@ -24,7 +24,7 @@ from rclpy.waitable import NumberOfEntities, Waitable
 from std_srvs.srv import Trigger
 
 from calib_planner.ros.messages import point_message
-from calib_planner.ros.qos import EVENTS
+from calib_planner.ros.parameters import EVENTS
 from calib_planner.ros.rclpy_ext.lifecycle import TidyLifecycleNode, given_parameters
 from calib_planner.ros.rclpy_ext.run import spin_once
 

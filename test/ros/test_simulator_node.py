@@ -22,7 +22,7 @@ from calib_planner.planning import Search
 from calib_planner.ros.messages import nanoseconds, plan_to_message
 from calib_planner.ros.nodes import simulator as simulator_node
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.qos import SENSOR_IN
+from calib_planner.ros.parameters import SENSOR_IN
 from calib_planner.simulation import Tour, make_tour
 
 ACTION = "tracker_simulator/execute_plan"

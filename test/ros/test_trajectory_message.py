@@ -16,7 +16,7 @@ from robots import mixed, plan_of, random_configurations
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_planner import Robot
-from calib_planner.io.sheet import trajectory_text
+from calib_planner.io.plan import trajectory_text
 from calib_planner.planning import plan_sheet
 
 pytestmark = pytest.mark.ros

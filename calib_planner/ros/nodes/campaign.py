@@ -50,7 +50,7 @@ from calib_planner.ros.campaign import (
 from calib_planner.ros.lifecycle import ManagedNode, reason_of
 from calib_planner.ros.messages import reasons_of, stamp_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
-from calib_planner.ros.qos import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import CampaignParameters
 from calib_planner.units import cut

@@ -41,7 +41,7 @@ from calib_planner.ros.messages import (
     stamp_message,
 )
 from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
-from calib_planner.ros.qos import EVENTS, LATCHED, STREAM_IN
+from calib_planner.ros.parameters import EVENTS, LATCHED, STREAM_IN
 from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.session import Matching, Session, TooFew, condition_of

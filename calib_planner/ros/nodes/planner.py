@@ -30,8 +30,8 @@ from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.markers import plan_markers
 from calib_planner.ros.messages import pace_of, plan_to_message, trajectory_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
+from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.planning import Answer, answer, constraints_of
-from calib_planner.ros.qos import LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PlannerParameters
 

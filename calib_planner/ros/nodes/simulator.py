@@ -27,7 +27,7 @@ from calib_planner.ros.executor import check_executable
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.messages import joints_message, plan_from_message, point_message
 from calib_planner.ros.model import load_shipped
-from calib_planner.ros.qos import SENSOR_OUT
+from calib_planner.ros.parameters import SENSOR_OUT
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import SimulatorParameters
 from calib_planner.simulation import (
