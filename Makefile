@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test docs lint bench soak faults clean
+.PHONY: help setup demo test prove docs lint bench soak faults clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -14,6 +14,9 @@ demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 
 test: setup ## run every test, in as many processes as there are cores (PYTEST='-k plan' for some)
 	@. ./env.sh && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
+
+prove: setup ## every test with all its seeds and turns, of which make test takes a sample
+	@CALIB_PLANNER_PROVE=1 $(MAKE) test
 
 docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
 	@. ./env.sh && python tools/reference && \

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from calib_planner import Plan, Robot
 from calib_planner.io import parse_urdf
+
+T = TypeVar("T")
+PROVE = os.environ.get("CALIB_PLANNER_PROVE") == "1"
+"""``make prove``: every test with all its seeds; ``make test`` takes a sample of them."""
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -29,6 +35,11 @@ MIXED_URDF = """<?xml version="1.0"?>
     <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
 </robot>
 """
+
+
+def repeats(sample: T, every: T) -> T:
+    """The seeds, turns or examples of a test: a sample, or with ``make prove`` every one."""
+    return every if PROVE else sample
 
 
 def mixed() -> Robot:

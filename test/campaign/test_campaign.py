@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robots import repeats
 from worlds import POSE, SIGMA, achieved, campaign, kuka, planar, world_of
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, UnknownNameError, identify, plan
@@ -76,7 +77,7 @@ def test_same_seed_same_campaign():
     assert results[0].to_dict()["rounds"] == results[1].to_dict()["rounds"]
 
 
-@pytest.mark.parametrize("seed", [1])
+@pytest.mark.parametrize("seed", repeats([1], [0, 1]))
 def test_more_noise_than_stated_is_noticed_and_measured_away(seed):
     plain = campaign(planar(10e-6, seed, budget=200), world_of(planar().robot, seed))
     world = world_of(planar().robot, seed, sigma=2 * SIGMA)
@@ -95,7 +96,7 @@ def test_less_noise_than_stated_saves_measurements():
     assert achieved(result, world, planar().test_pose_array) < 3 * result.accuracy
 
 
-@pytest.mark.parametrize("seed", [1])
+@pytest.mark.parametrize("seed", repeats([1], [1, 2]))
 def test_errors_of_the_joints_are_learnt_or_named(seed):
     """0.4 mrad in every joint: with corrections the accuracy is reached in truth; without, it says why not."""
     world = world_of(kuka().robot, seed, transmission=4e-4)
@@ -125,7 +126,7 @@ def test_repetitions_tell_noise_from_the_robot():
 # ── what cannot be measured ──────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("seed", [1])
+@pytest.mark.parametrize("seed", repeats([1], [0, 1]))
 def test_an_unreachable_region_is_planned_around(seed):
     problem = kuka(15e-6, seed)
     world = world_of(problem.robot, seed)

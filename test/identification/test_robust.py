@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cells import SIGMA, TARGETS, bare, placed_cell, plain_cell, rejected, spoil
-from robots import random_configurations
+from robots import random_configurations, repeats
 from scipy.stats import binom, chi2
 
 from calib_planner import IdentificationProblem, NotEnoughDataError, Robot, identify
@@ -16,10 +16,10 @@ from calib_planner.units import length
 
 NOISE = {"known": {"sigma": SIGMA}, "unknown": {}}
 CELLS = {
-    "kuka": (plain_cell, 40, 6),
-    "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, 4),
-    "full base tool": (placed_cell, 50, 2),
-    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, 2),
+    "kuka": (plain_cell, 40, repeats(6, 12)),
+    "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, repeats(4, 6)),
+    "full base tool": (placed_cell, 50, repeats(2, 4)),
+    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, repeats(2, 4)),
 }
 
 

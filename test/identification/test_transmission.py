@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import SHARED_DATA, mixed, random_configurations
+from robots import SHARED_DATA, mixed, random_configurations, repeats
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify, validate
 from calib_planner.identification import JointCorrections, cross_validate, normalised, phases
@@ -139,7 +139,7 @@ def test_measured_ur10():
     folder = SHARED_DATA / "ur10_tracker"
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
     data = read_measurements(folder / "random_poses.csv", robot).data
-    for seed in (0,):
+    for seed in repeats([0], [0, 1]):
         rows = np.random.default_rng(seed).choice(len(data), 100, replace=False)
         rest = data.select(np.setdiff1d(np.arange(len(data)), rows))
         problem = IdentificationProblem(robot, data.select(rows))

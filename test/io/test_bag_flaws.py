@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import repeats
 
 pytest.importorskip("rosbags")
 
@@ -259,7 +260,7 @@ def test_no_byte_can_bring_a_traceback(tmp_path: Path, plugin: str, compression:
     (storage,) = (p for p in bag.iterdir() if p.suffix in (".db3", ".mcap"))
     sound = storage.read_bytes()
     refused = 0
-    for turn in range(30):
+    for turn in range(repeats(30, 60)):
         data = bytearray(sound)
         ends = rng.integers(len(data), size=2) if rng.random() < 0.5 else (0, 2000)
         for at in rng.integers(min(ends), max(ends) + 1, size=rng.integers(1, 30)):

@@ -13,7 +13,7 @@ import yaml
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from robots import mixed, random_configurations
+from robots import mixed, random_configurations, repeats
 
 from calib_planner import (
     Estimate,
@@ -63,7 +63,7 @@ def plans(draw: st.DrawFn) -> Plan:
     return Plan.from_values(drawn)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=repeats(30, 60), deadline=None)
 @given(written=plans())
 def test_plans_come_back_to_the_bit(written: Plan) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -283,7 +283,7 @@ def small() -> Estimate:
     return identify(IdentificationProblem(robot, data, test_poses=[[0.1, 0.2]]))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=repeats(20, 40), deadline=None)
 @given(data=st.data())
 def test_any_numbers_come_back(small: Estimate, data: st.DataObject) -> None:
     """Whatever stands in an estimate: extreme, denormal, −0, infinite where that can be, any text."""

@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
-from robots import mixed, random_configurations
+from robots import mixed, random_configurations, repeats
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
 from calib_planner.planning import Candidates, PlanPrior, Search, plan_space
@@ -106,9 +106,9 @@ def best_worth_of_search(space: PlanSpace, support: np.ndarray, weights: np.ndar
 # ── no plan beats its bound ──────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("block", range(3))
+@pytest.mark.parametrize("block", repeats(range(3), range(10)))
 def test_no_plan_of_a_random_chain_beats_its_bound(block):
-    """Sixty random problems: chains, parameters, criteria, priors, repetitions."""
+    """Sixty random problems, with ``make prove`` two hundred (chains, parameters, criteria, priors)."""
     done = 0
     for seed in range(20 * block, 20 * block + 20):
         try:
@@ -160,12 +160,12 @@ def test_equation_20_to_the_tolerance_of_the_proof():
         assert 1.0 - 1e-12 <= ceiling * (1 + abs(np.sin(q0[1]))) / m <= 1.0 + 1e-7
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", repeats(range(4), range(8)))
 def test_no_plan_of_the_kuka_beats_its_bound(seed):
     """Random test poses: the plan searched for, and random ones."""
     robot = Robot.load("kuka_kr270")
     q0 = random_configurations(robot, 1, seed)
-    m = (3, 4, 6, 12)[seed]
+    m = (3, 4, 6, 12)[seed % 4]
     found = plan(PlanProblem(robot, q0, m, search=Search(starts=4, general_weight=0.0, seed=seed)), prove=True)
     assert found.quality.bound == "proven"
     assert "proven to" in found.quality.message
