@@ -177,7 +177,7 @@ def test_rooms_are_entered_by_their_doors(place: str) -> None:
 
 def test_the_paper_is_used_by_its_command_only() -> None:
     used = {(m, i.module) for m, p in FILES.items() for i in imports(tree_of(p)) if "_paper" in i.module}
-    assert used == {("calib_planner.cli.main", "calib_planner_paper.command")}
+    assert used == {("calib_planner.cli.main", "calib_planner_paper.reproduce")}
 
 
 def examples_and_benches() -> Iterator[tuple[str, str]]:

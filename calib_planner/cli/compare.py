@@ -20,7 +20,6 @@ EXAMPLE = """calib-planner compare --robot kuka_kr270 --degrees --test-pose "0 -
 
 
 def add(commands: Commands, summary: str) -> None:
-    """Add the command's parser."""
     parser = add_command(commands, "compare", summary, run, EXAMPLE)
     work = add_problem(parser, any_criterion=False)
     option(work, "--configurations", "M", "numbers of configurations", kind=int, nargs="+")
@@ -29,7 +28,6 @@ def add(commands: Commands, summary: str) -> None:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    """Do the work."""
     sizes = [(m, 1) for m in args.configurations or ()] + [_size(word) for word in args.replicate or ()]
     if not sizes:
         raise InputError("--configurations", "none", "at least one number", "or give --replicate 3x4")

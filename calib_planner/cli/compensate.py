@@ -41,7 +41,6 @@ ERRORS = ("position_error", "rotation_error", "reached")
 
 
 def add(commands: Commands, summary: str) -> None:
-    """Add the command's parser."""
     parser = add_command(commands, "compensate", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser, targets=False)
     what = parser.add_argument_group("what to correct")
@@ -59,7 +58,6 @@ def add(commands: Commands, summary: str) -> None:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    """Do the work."""
     nominal = load_robot(args)
     saved = read_estimate(args.estimate)
     learnt = None if args.geometry_only else saved.joint_corrections

@@ -15,7 +15,6 @@ and with random plans of the same size. Needs no ROS. Shown in mm; with --json i
 
 
 def add(commands: Commands, summary: str) -> None:
-    """Add the command's parser."""
     usual = DemoSettings()
     parser = add_command(commands, "demo", summary, run, "calib-planner demo --seed 3", DESCRIPTION)
     option(parser, "--configurations", "M", "number of different configurations", usual.configurations)
@@ -26,7 +25,6 @@ def add(commands: Commands, summary: str) -> None:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    """Do the work."""
     settings = DemoSettings(args.configurations, args.repetitions, args.sigma, seed=args.seed)
     with terminal.progress("planning, then random plans to compare with") as update:
 

@@ -31,7 +31,7 @@ COMMANDS = {
     "simulate": ("calib_planner.cli.simulate", "measure a plan with a simulated robot"),
     "robots": ("calib_planner.cli.robots", "list the shipped robots, or show one"),
     "demo": ("calib_planner.cli.demo", "plan, measure and identify a simulated robot"),
-    "reproduce": ("calib_planner_paper.command", "the paper's tables and figures, computed again"),
+    "reproduce": ("calib_planner_paper.reproduce", "the paper's tables and figures, computed again"),
 }
 """Name → module, and what the command does in a few words."""
 NO_PAPER = (

@@ -69,7 +69,6 @@ EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 
 
 
 def add(commands: Commands, summary: str) -> None:
-    """Add the command's parser."""
     parser = add_command(commands, "plan", summary, run, EXAMPLE)
     work = add_problem(parser, any_criterion=True)
     size = work.add_mutually_exclusive_group(required=True)
@@ -84,7 +83,6 @@ def add(commands: Commands, summary: str) -> None:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    """Do the work."""
     _check(args)
     size = 1 if args.configurations is None else args.configurations
     problem = make_problem(args, size, 1 if args.repetitions is None else args.repetitions)

@@ -32,7 +32,6 @@ EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 
 
 
 def add(commands: Commands, summary: str) -> None:
-    """Add the command's parser."""
     text = (
         "Write everything that a person at the robot needs to measure a plan: with --output a printable page,\n"
     )
@@ -54,7 +53,6 @@ def add(commands: Commands, summary: str) -> None:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    """Do the work."""
     if not args.plan.lower().endswith((".yaml", ".yml")):
         advice = "a CSV of configurations carries no accuracy; write the plan with --output plan.yaml"
         raise FileFormatError(args.plan, "file", "another kind of file", "a plan .yaml", advice)

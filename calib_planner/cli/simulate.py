@@ -39,7 +39,6 @@ EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7
 
 
 def add(commands: Commands, summary: str) -> None:
-    """Add the command's parser."""
     parser = add_command(commands, "simulate", summary, run, EXAMPLE)
     add_robot(parser)
     add_parameters(parser)
@@ -66,7 +65,6 @@ def assignment(text: str) -> tuple[str, float]:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    """Do the work."""
     robot = choose_parameters(load_robot(args), args)
     configurations, repetitions = _plan(robot, args)
     check_count("--seed", args.seed, low=0, high=2**63 - 1)

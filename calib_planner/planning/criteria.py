@@ -163,12 +163,11 @@ class DiagonalDeterminant(_Smooth):
 
 
 @dataclass(frozen=True)
-class PowerMean:
+class PowerMean(_Smooth):
     """(tr M^(−s) / p)^(−1/s): s = 1 is A, s = ½ is O5, s → ∞ is E (searched with s = 8, reported exactly)."""
 
     power: float
     smallest: bool = False
-    concave: bool = True
 
     def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         s = self.power
@@ -182,7 +181,7 @@ class PowerMean:
 
     def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         if not self.smallest:
-            return self.value_and_gradient(matrix[None])[1][0]
+            return super().supporting_gradient(matrix)
         values, vectors = np.linalg.eigh(matrix)
         weights = (values[0] / np.maximum(values, 1e-300)) ** (self.power + 1.0)
         return (vectors * (weights / weights.sum())) @ vectors.T
@@ -190,7 +189,7 @@ class PowerMean:
     def exact(self, matrix: FloatArray) -> float:
         if self.smallest:
             return float(max(np.linalg.eigvalsh(matrix)[0], 0.0))
-        return float(self.value_and_gradient(matrix[None])[0][0])
+        return super().exact(matrix)
 
 
 @dataclass(frozen=True)

@@ -323,7 +323,7 @@ def test_command(
     result: Reproduction, folder: Path, tmp_path: Path, monkeypatch: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What the command adds to the library; the work itself is done once, above. Same result, same bytes."""
-    command = importlib.import_module("calib_planner_paper.command")
+    command = importlib.import_module("calib_planner_paper.reproduce")
     asked: list[ReproductionSettings] = []
 
     def done(settings: ReproductionSettings, update: Any) -> Reproduction:
@@ -367,7 +367,7 @@ def test_help_has_units_and_an_example(capsys: pytest.CaptureFixture[str]) -> No
 def test_bad_input_before_any_work(
     words: list[str], needle: str, tmp_path: Path, monkeypatch: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = importlib.import_module("calib_planner_paper.command")
+    command = importlib.import_module("calib_planner_paper.reproduce")
     monkeypatch.setattr(command, "reproduce", lambda *_: pytest.fail("worked"))
     file = tmp_path / "file"
     file.write_text("")
@@ -397,7 +397,7 @@ raise SystemExit(main(["reproduce"]))
 
 def test_a_figure_that_cannot_be_written(result: Reproduction, tmp_path: Path, monkeypatch: Any) -> None:
     (tmp_path / "figure_2.svg").mkdir()
-    monkeypatch.setattr(importlib.import_module("calib_planner_paper.command"), "reproduce", lambda *_: result)
+    monkeypatch.setattr(importlib.import_module("calib_planner_paper.reproduce"), "reproduce", lambda *_: result)
     assert main(["reproduce", "--output", str(tmp_path)]) == 2
 
 

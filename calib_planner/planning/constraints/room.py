@@ -51,7 +51,6 @@ class WorkspaceBox(PostureConstraint):
         object.__setattr__(self, "high", high)
 
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
-        """N postures → (N,)."""
         points = posture.targets
         if self.tip:
             points = np.concatenate([points, posture.tip_origin[:, None]], axis=1)
@@ -85,7 +84,6 @@ class MinimumHeight(PostureConstraint):
         object.__setattr__(self, "up", check_direction("up", self.up))
 
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
-        """N postures → (N,)."""
         up = np.asarray(self.up)
         origins = np.concatenate([posture.joint_origins, posture.tip_origin[:, None]], axis=1)
         heights = origins @ up

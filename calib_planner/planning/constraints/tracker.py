@@ -45,7 +45,6 @@ class TrackerRange(PostureConstraint):
             raise InputError("tracker range", f"{self.minimum} to {self.maximum}", "minimum < maximum, in m")
 
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
-        """N postures → (N,)."""
         d = distances(np.asarray(self.station), posture.targets)
         return np.asarray(((self.minimum <= d) & (d <= self.maximum)).all(axis=1))
 
@@ -76,7 +75,6 @@ class TrackerElevation(PostureConstraint):
             raise InputError("tracker elevation", f"{self.low} to {self.high}", "low < high, in rad")
 
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
-        """N postures → (N,)."""
         angle = elevations(np.asarray(self.station), np.asarray(self.up), posture.targets)
         return np.asarray(((self.low <= angle) & (angle <= self.high)).all(axis=1))
 
@@ -148,7 +146,6 @@ class LineOfSight(PostureConstraint):
             object.__setattr__(self, "near", check_number("near", self.near, low=0, unit="m"))
 
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
-        """N postures → (N,)."""
         station = np.asarray(self.station)
         radii = self.capsules.of(robot)[:-1]
         start, end = (points[:, None, :-1] for points in segments(robot, posture))

@@ -177,7 +177,7 @@ def choose(
             combinations of parameters that no candidate shows. Or there are fewer candidates than rows.
     """
     _check(problem)
-    search: _Search = _Exact(problem) if _is_determinant(problem.criterion) else _Shortlisted(problem)
+    search = _Exact(problem) if _is_determinant(problem.criterion) else _Shortlisted(problem)
     best: Choice | None = None
     count = evaluations = 0
     for start in _starts(problem, rng):
@@ -243,14 +243,6 @@ def _log_values(problem: ChoiceProblem, matrices: FloatArray) -> FloatArray:
     return log_values(problem.criterion, matrices + 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1]))
 
 
-class _Search:
-    """One start, exchanged to the end."""
-
-    def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
-        """Chosen rows, and exchanges tried."""
-        raise NotImplementedError
-
-
 # ── determinants: all candidates, exactly ────────────────────────────────────────────────────────────
 
 
@@ -259,7 +251,9 @@ def _is_determinant(criterion: Criterion) -> bool:
     return isinstance(inner, Determinant)
 
 
-class _Exact(_Search):
+class _Exact:
+    """``run`` exchanges one start to the end; it returns the chosen rows and the number of exchanges tried."""
+
     def __init__(self, problem: ChoiceProblem) -> None:
         self.problem = problem
         self.parts = [(1, scaled_rows(problem.rows, problem.prior, problem.size))]
@@ -316,7 +310,9 @@ class _Exact(_Search):
 # ── any other criterion: first-order shortlist ───────────────────────────────────────────────────────
 
 
-class _Shortlisted(_Search):
+class _Shortlisted:
+    """As ``_Exact``."""
+
     def __init__(self, problem: ChoiceProblem) -> None:
         self.problem = problem
         self.flat = problem.rows.reshape(-1, problem.rows.shape[2])
