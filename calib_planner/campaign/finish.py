@@ -113,7 +113,6 @@ def _held_out(state: CampaignState, count: int) -> FloatArray:
 
 
 def _result(state: CampaignState, known: Assessment | None) -> CampaignResult:
-    """What the campaign came to."""
     held_out = state.data(VALIDATION)
     estimate = None if known is None else known.estimate
     if known is not None and estimate is not None and held_out is not None:

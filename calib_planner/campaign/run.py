@@ -45,11 +45,7 @@ def run_campaign(
             return action.result
         if isinstance(action, Paused):
             raise InputError("state", "paused", "a campaign that runs", "use state.resume()")
-        state = _measured(state, action, measure) if isinstance(action, Measure) else _decided(state)
-
-
-def _decided(state: CampaignState) -> CampaignState:
-    return state.decided(decide(state))
+        state = _measured(state, action, measure) if isinstance(action, Measure) else state.decided(decide(state))
 
 
 def _measured(state: CampaignState, action: Measure, measure: Instrument) -> CampaignState:

@@ -10,7 +10,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import FloatArray
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
@@ -127,9 +126,5 @@ def show_compensation(result: Compensation, console: Console) -> None:
     ]
     for label, values in rows:
         if not np.isnan(values).any():
-            table.add_row(label, *(f"{1e3 * v:.4g}" for v in _mean_and_largest(values)))
+            table.add_row(label, *(f"{1e3 * v:.4g}" for v in (values.mean(), values.max())))
     console.print(table)
-
-
-def _mean_and_largest(values: FloatArray) -> tuple[float, float]:
-    return float(values.mean()), float(values.max())

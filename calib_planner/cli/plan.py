@@ -251,7 +251,6 @@ def _compound(words: list[str]) -> dict[str, float]:
 
 
 def _prior(given: str | None, robot: Robot) -> dict[str, float]:
-    """Standard deviations by parameter, of a file or of the typical prior."""
     if given is None:
         return {}
     prior = typical_prior(robot) if given == TYPICAL else read_prior(given, robot).prior

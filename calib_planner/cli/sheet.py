@@ -86,7 +86,6 @@ def tell_sheet(written: list[str], terminal: Terminal) -> None:
 
 
 def _pace(robot: Robot, args: argparse.Namespace) -> Pace:
-    """Speeds as the options say, or the robot's."""
     dwell = check_number("--dwell", args.dwell, low=0, high=86_400, unit="s")
     if args.speed is not None:
         speed = check_number("--speed", args.speed, low=0, low_open=True, high=100.0, unit="rad/s or m/s")

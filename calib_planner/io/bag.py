@@ -440,5 +440,4 @@ def _numbered(path: Path) -> list[Any]:
 
 
 def _list(names: list[str]) -> str:
-    """Topics or files, as many as an error shows."""
     return listed(names, 20, width=200, none="nothing")

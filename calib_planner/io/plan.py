@@ -211,24 +211,17 @@ def trajectory(sheet: PlanSheet) -> dict[str, Any]:
     for i, broken in enumerate(sheet.checks.reach_breaks, 1):
         if broken:
             raise InfeasibleError(", ".join(broken), f"visit {i} of the plan breaks it; no trajectory goes there")
-    times, points = sheet.timetable, []
-    for q, arrive, leave in zip(sheet.plan.configurations.tolist(), times.arrive, times.leave, strict=True):
-        points.append(_point(q, arrive))
-        if times.pace.dwell > 0:
-            points.append(_point(q, leave))
     return {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
         "joint_names": list(sheet.plan.joint_names),
-        "points": points,
-    }
-
-
-def _point(positions: list[float], seconds: float) -> dict[str, Any]:
-    after = round(float(seconds) * NANO)
-    return {
-        "positions": list(positions),
-        "velocities": [0.0] * len(positions),
-        "accelerations": [],
-        "effort": [],
-        "time_from_start": {"sec": after // NANO, "nanosec": after % NANO},
+        "points": [
+            {
+                "positions": list(q),
+                "velocities": [0.0] * len(q),
+                "accelerations": [],
+                "effort": [],
+                "time_from_start": {"sec": after // NANO, "nanosec": after % NANO},
+            }
+            for q, after in sheet.timetable.points(sheet.plan.configurations)
+        ],
     }

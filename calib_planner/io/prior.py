@@ -82,7 +82,6 @@ def read_prior(path: str | Path, robot: Robot, *, targets: bool = False) -> Prio
 
 
 def _expected(entry: Node, name: str, nominal: Mapping[str, Parameter], placed: set[str]) -> tuple[float, float]:
-    """Expected value and standard deviation of one parameter [m | rad]."""
     if name not in nominal:
         advice = UnknownNameError("", name, list(nominal)).advice
         raise entry.error("no parameter to be identified", f"one of: {listed(nominal)}", advice)

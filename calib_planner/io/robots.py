@@ -177,7 +177,6 @@ def _joint_name(node: Node, joint_names: Sequence[str]) -> str:
 
 
 def _table(table: Node, names: Sequence[str], *, modified: bool) -> tuple[list[Element], Levels]:
-    """A Denavit–Hartenberg table."""
     table.mapping(TABLE_KEYS, ("rows",))
     length = LENGTHS[table.get("length_unit", "m").choice(LENGTHS)]
     angle = ANGLES[table.get("angle_unit", "rad").choice(ANGLES)]

@@ -105,9 +105,14 @@ def approximate_design(
         rounds: Most rounds.
         gap: Relative.
     """
-    if problem.candidates is not None:
-        return _design_over_candidates(problem, problem.candidates, cancel)
     model, n = problem.model, problem.measurements
+    if problem.candidates is not None:
+        q = problem.candidates[problem.feasibility.mask(problem.candidates)]
+        if not len(q):
+            raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
+        rows = model.whitened(q)
+        design = candidate_design(rows, problem.criterion, problem.prior, n, problem.distinct, cancel)
+        return replace(design, support=q)
     everywhere = model.at(problem.feasibility.sample(rng, SPREAD)).mean(axis=0)
     support: FloatArray = np.concatenate([start, problem.feasibility.sample(rng, 16)])
     weights: FloatArray = np.full(len(support), 1.0 / len(support))
@@ -236,17 +241,6 @@ def _reweighted(
 
 
 # ── among candidates ─────────────────────────────────────────────────────────────────────────────────
-
-
-def _design_over_candidates(
-    problem: DesignProblem, candidates: FloatArray, cancel: Callable[[], bool]
-) -> ApproximateDesign:
-    q = candidates[problem.feasibility.mask(candidates)]
-    if not len(q):
-        raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
-    rows, distinct = problem.model.whitened(q), problem.distinct
-    best = candidate_design(rows, problem.criterion, problem.prior, problem.measurements, distinct, cancel)
-    return replace(best, support=q)
 
 
 def candidate_design(

@@ -234,7 +234,6 @@ def _choose(
     rng: np.random.Generator,
     clock: _Clock,
 ) -> SearchResult:
-    """The best choice from the candidates."""
     problem = space.problem
     candidates = np.asarray(problem.candidate_array)
     allowed = np.flatnonzero(space.feasibility.mask(candidates))

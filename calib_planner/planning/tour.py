@@ -119,6 +119,15 @@ class Timetable:
         """Length of the whole [s]."""
         return float(self.leave[-1])
 
+    def points(self, configurations: FloatArray) -> list[tuple[list[float], int]]:
+        """Where the robot is at rest, and when: rows of ``configurations`` (m, joints) [rad | m], and time [ns].
+
+        A visit has a point of arrival and, if the standstill has a length, one of departure.
+        """
+        visits = zip(configurations.tolist(), self.arrive, self.leave, strict=True)
+        ends = 2 if self.pace.dwell > 0 else 1
+        return [(q, round(float(t) * 1_000_000_000)) for q, *times in visits for t in times[:ends]]
+
     @property
     def standing(self) -> float:
         """Share of it at standstill [s]."""

@@ -122,7 +122,6 @@ def _facts(sheet: PlanSheet) -> Iterator[tuple[str, str, str]]:
 
 
 def _alarms(sheet: PlanSheet) -> Iterator[str]:
-    """What must not be overlooked."""
     plan, checks = sheet.plan, sheet.checks
     for word, mask in (("reachable", checks.reachable), ("visible", checks.visible)):
         wrong = [] if mask is None else [str(i + 1) for i in np.flatnonzero(~mask)]

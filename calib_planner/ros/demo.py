@@ -172,7 +172,6 @@ class DemoClient:
         return finished.result().result if finished.done() else None
 
     def _missing(self, plan: PlanMessage) -> PlanMessage:
-        """The part of a plan that was not measured yet."""
         n = len(plan.joint_names)
         left = [max(r - c, 0) for r, c in zip(plan.repetitions, self.measured(plan), strict=True)]
         rows = [i for i, count in enumerate(left) if count] or list(range(len(left)))

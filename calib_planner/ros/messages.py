@@ -305,16 +305,10 @@ def trajectory_message(plan: Plan, robot: Robot, pace: Pace, stamp: int, frame_i
     Raises:
         InputError: The tour takes longer than a ROS duration can hold.
     """
-    times = timetable(plan, robot, pace)
     result = JointTrajectory(joint_names=list(plan.joint_names))
     result.header.stamp, result.header.frame_id = stamp_message(stamp), frame_id
-    for q, arrive, leave in zip(plan.configurations.tolist(), times.arrive, times.leave, strict=True):
-        result.points += [_point(q, t) for t in ((arrive, leave) if pace.dwell > 0 else (arrive,))]
+    for q, after in timetable(plan, robot, pace).points(plan.configurations):
+        point = JointTrajectoryPoint(positions=q, velocities=[0.0] * len(q))
+        point.time_from_start = Duration(sec=after // NANO, nanosec=after % NANO)
+        result.points.append(point)
     return result
-
-
-def _point(positions: list[float], seconds: float) -> JointTrajectoryPoint:
-    after = round(float(seconds) * NANO)
-    point = JointTrajectoryPoint(positions=positions, velocities=[0.0] * len(positions))
-    point.time_from_start = Duration(sec=after // NANO, nanosec=after % NANO)
-    return point

@@ -202,7 +202,6 @@ class NodeParameters(Generic[P]):
         self.value = replace(self.value, **self._own(changes))  # type: ignore[type-var]
 
     def _own(self, changes: list[Parameter]) -> dict[str, Any]:
-        """The changes of parameters declared here, by name."""
         return _plain({c.name: c.value for c in changes if c.name in self._items})
 
 
@@ -223,11 +222,9 @@ EVENTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 SENSOR_OUT = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 """Streams that the nodes publish."""
 
-SENSOR_IN = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Streams that the nodes subscribe to: best effort matches every publisher, reliable or not."""
-
 STREAM_IN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""The same where few may be lost: the queue holds five seconds at 1 kHz."""
+"""Streams that the nodes subscribe to: best effort matches every publisher, reliable or not, and the queue holds
+five seconds at 1 kHz."""
 
 REQUESTS = QoSProfile(depth=100)
 """Requests: rclpy's depth of 10 loses some of a burst, whose clients then wait for ever."""

@@ -30,7 +30,7 @@ from calib_planner import Robot
 from calib_planner.acquisition import NANO
 from calib_planner.io import config_folder
 from calib_planner.ros.messages import nanoseconds, plan_to_message
-from calib_planner.ros.parameters import SENSOR_IN
+from calib_planner.ros.parameters import STREAM_IN
 from calib_planner.ros.settings import SimulatorParameters
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "connecting.md").read_text()
@@ -83,7 +83,7 @@ def test_stamps_of_a_clock_of_its_own(tmp_path: Path) -> None:
 def test_the_driver_publishes_metres_and_stamps(bench: Bench, tmp_path: Path) -> None:
     driver = module_of("tracker_driver.py", tmp_path)
     waiting = [(100.0, 1000.0, -2000.0, 500.0), (100.02, math.nan, math.nan, math.nan)]
-    heard = bench.hear(PointStamped, "tracker/point", SENSOR_IN)
+    heard = bench.hear(PointStamped, "tracker/point", STREAM_IN)
 
     def read() -> list[tuple[float, ...]]:
         if not bench.client.count_publishers("tracker/point"):

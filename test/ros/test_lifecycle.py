@@ -24,7 +24,7 @@ from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.planner import PlannerNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_IN, parameter
+from calib_planner.ros.parameters import EVENTS, LATCHED, STREAM_IN, parameter
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Small(ManagedNode[SmallParameters]):
         self.log.append("configure")
         self.undo_with(self.log.append, "undone")
         self.said = self.create_publisher(String, "~/said", LATCHED)
-        self.heard = self.create_subscription(String, "heard", functools.partial(self._echo, "!"), SENSOR_IN)
+        self.heard = self.create_subscription(String, "heard", functools.partial(self._echo, "!"), STREAM_IN)
         self.create_service(Trigger, "~/fail", self._fail)
         if self.settings.value.size == 9:
             raise InputError("size", 9, "less than 9 for this test")
@@ -202,7 +202,7 @@ def test_qos_is_overridden(bench: Bench) -> None:
     assert node.said.qos_profile.durability == DurabilityPolicy.VOLATILE and node.said.qos_profile.depth == 7
     assert node.heard.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     assert LATCHED.durability == DurabilityPolicy.TRANSIENT_LOCAL and LATCHED.depth == 1
-    assert SENSOR_IN.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert STREAM_IN.reliability == ReliabilityPolicy.BEST_EFFORT
 
 
 @pytest.mark.parametrize(

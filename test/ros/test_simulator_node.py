@@ -22,7 +22,7 @@ from calib_planner.planning import Search
 from calib_planner.ros.messages import nanoseconds, plan_to_message
 from calib_planner.ros.nodes import simulator as simulator_node
 from calib_planner.ros.nodes.simulator import SimulatorNode
-from calib_planner.ros.parameters import SENSOR_IN
+from calib_planner.ros.parameters import STREAM_IN
 from calib_planner.simulation import Tour, make_tour
 
 ACTION = "tracker_simulator/execute_plan"
@@ -43,8 +43,8 @@ def goal_of(planned: Plan, **changes: Any) -> ExecutePlan.Goal:
 
 
 def test_it_visits_every_configuration(bench: Bench, planned: Plan) -> None:
-    states = bench.hear(JointState, "joint_states", SENSOR_IN)
-    points = bench.hear(PointStamped, "tracker/point", SENSOR_IN)
+    states = bench.hear(JointState, "joint_states", STREAM_IN)
+    points = bench.hear(PointStamped, "tracker/point", STREAM_IN)
     bench.start(SimulatorNode, robot="planar_2r", true_deviations="l1=0.002", joint_speed=50.0, sigma=1e-5)
     bench.wait(lambda: states and points)
     feedback: list[Any] = []
@@ -87,7 +87,7 @@ def test_a_short_motion_is_seen_however_long_it_takes_to_think_of_it(
         return make_tour(*args)
 
     monkeypatch.setattr(simulator_node, "make_tour", slow)
-    states = bench.hear(JointState, "joint_states", SENSOR_IN)
+    states = bench.hear(JointState, "joint_states", STREAM_IN)
     bench.start(SimulatorNode, robot="planar_2r", joint_speed=12.0)
     client = bench.action(ExecutePlan, ACTION)
     one = {"configurations": planned.configurations[0].tolist(), "repetitions": [1]}
@@ -156,8 +156,8 @@ def test_a_plan_without_end_is_refused(bench: Bench, planned: Plan) -> None:
 
 
 def test_faults_by_parameter(bench: Bench) -> None:
-    points = bench.hear(PointStamped, "tracker/point", SENSOR_IN)
-    states = bench.hear(JointState, "joint_states", SENSOR_IN)
+    points = bench.hear(PointStamped, "tracker/point", STREAM_IN)
+    states = bench.hear(JointState, "joint_states", STREAM_IN)
     faults = {"dropout_probability": 0.5, "tracker_clock_offset": 1000.0, "encoder_resolution": 0.1}
     node = bench.start(SimulatorNode, robot="planar_2r", outlier_probability=0.3, **faults)
     bench.wait(lambda: len(points) > 100 and len(states) > 100)
@@ -174,7 +174,7 @@ def test_faults_by_parameter(bench: Bench) -> None:
 
 
 def test_an_instrument(bench: Bench) -> None:
-    points = bench.hear(PointStamped, "tracker/point", SENSOR_IN)
+    points = bench.hear(PointStamped, "tracker/point", STREAM_IN)
     bench.start(SimulatorNode, robot="planar_2r", instrument="laser_tracker", sigma=0.9)
     bench.wait(lambda: len(points) > 100)
     xyz = np.array([[m.point.x, m.point.y, m.point.z] for m in points])
@@ -211,8 +211,8 @@ def test_new_faults_from_a_new_configure(bench: Bench) -> None:
     node.trigger_configure()
     node.trigger_activate()
     assert node.is_active and node.world.faults.dropout_probability == 1.0
-    states = bench.hear(JointState, "joint_states", SENSOR_IN)
-    points = bench.hear(PointStamped, "tracker/point", SENSOR_IN)
+    states = bench.hear(JointState, "joint_states", STREAM_IN)
+    points = bench.hear(PointStamped, "tracker/point", STREAM_IN)
     bench.wait(lambda: len(states) > 50)
     assert not points
 

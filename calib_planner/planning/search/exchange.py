@@ -267,7 +267,7 @@ class _Exact:
         state = [(sign, RunningDeterminant(candidates, start)) for sign, candidates in self.parts]
         tried = 0
         while len(chosen) < problem.size:
-            chosen.append(self._best(state, chosen))
+            chosen.append(int(np.argmax(self._gains(state, chosen))))
             self._change(state, chosen[-1], 1)
         for _ in range(MOST_PASSES):
             changed = 0
@@ -293,9 +293,6 @@ class _Exact:
         if not self.problem.repeat:
             gains[taken] = -np.inf
         return gains
-
-    def _best(self, state: list[tuple[int, RunningDeterminant]], taken: list[int]) -> int:
-        return int(np.argmax(self._gains(state, taken)))
 
     def _change(self, state: list[tuple[int, RunningDeterminant]], row: int, sign: int) -> None:
         for _, part in state:

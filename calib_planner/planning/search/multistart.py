@@ -145,7 +145,9 @@ def _starts(
     if rounded:
         picks = rng.choice(len(problem.support), (rounded, size), p=problem.weights)
         parts.append(_shake(problem, problem.support[picks], rng))
-    kernel_size = _smallest(problem)
+    # So many configurations are needed to identify everything without a prior.
+    robot = problem.model.robot
+    kernel_size = max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
     tiled = -(-starts // 3) if kernel_size < size else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
@@ -157,12 +159,6 @@ def _starts(
     random = max(starts - rounded - tiled, 1)
     parts.append(draw(rng, random * size).reshape(random, size, -1))
     return np.concatenate(parts), evaluations
-
-
-def _smallest(problem: SearchProblem) -> int:
-    """Configurations needed to identify everything without a prior."""
-    robot = problem.model.robot
-    return max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
 
 
 def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
