@@ -124,7 +124,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
 def _best(progress: Progress, criterion: str) -> str:
     if not progress.starts_done:
         return ""
-    if criterion in ("test_pose", "worst_pose"):
+    if criterion in POSE_CRITERIA:
         return f"best ρ0 {length(progress.best_accuracy)}"
     return f"best value {progress.best_accuracy:.4g}"
 

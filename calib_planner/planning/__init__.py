@@ -17,7 +17,7 @@ from calib_planner.planning.constraints import (
     WorkspaceBox,
 )
 from calib_planner.planning.constraints.self_collision import SelfCollision
-from calib_planner.planning.criteria import CRITERIA, Determinant
+from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA, Determinant
 from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.feasibility import Constraint, Feasibility
 from calib_planner.planning.information import (
@@ -29,7 +29,6 @@ from calib_planner.planning.information import (
 )
 from calib_planner.planning.planner import Callback, Progress, plan
 from calib_planner.planning.problem import (
-    POSE_CRITERIA,
     Candidates,
     PlanPrior,
     PlanProblem,

@@ -15,6 +15,7 @@ import numpy as np
 
 from calib_planner.arrays import check_count, check_number
 from calib_planner.errors import InfeasibleError, InputError
+from calib_planner.planning.criteria import POSE_CRITERIA
 from calib_planner.planning.information import plan_space, smallest_size
 from calib_planner.planning.planner import plan, value_of
 from calib_planner.planning.problem import PlanProblem
@@ -142,6 +143,6 @@ def split_budget(
 
 
 def _check_metric(problem: PlanProblem) -> None:
-    if problem.criterion not in ("test_pose", "worst_pose") or problem.compound:
+    if problem.criterion not in POSE_CRITERIA or problem.compound:
         raise InputError("criterion", problem.criterion, "test_pose or worst_pose, the criteria in metres")
     plan_space(replace(problem, configurations=max(problem.configurations, smallest_size(problem))))

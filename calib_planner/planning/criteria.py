@@ -37,6 +37,8 @@ from calib_planner.arrays import FloatArray
 
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
 """Names that a problem may use."""
+POSE_CRITERIA = ("test_pose", "worst_pose")
+"""Those that need test poses; their values are accuracies [m]."""
 RIDGE = 1e-12
 """Added to the information of a plan while searching, relative to its mean diagonal, so that singular plans stay
 finite."""
@@ -342,7 +344,7 @@ def log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
     return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)
 
 
-MINIMISED = ("test_pose", "worst_pose", "a")
+MINIMISED = (*POSE_CRITERIA, "a")
 """Criteria whose reported value is the better the smaller it is."""
 
 
@@ -350,7 +352,7 @@ def reported_value(name: str, psi: float, size: int, measurements: int) -> float
     """The reported value (last column of the table at the top) for Ψ."""
     if psi <= 0:
         return float("inf") if name in MINIMISED else 0.0
-    if name in ("test_pose", "worst_pose"):
+    if name in POSE_CRITERIA:
         return float(psi**-0.5)
     if name == "a":
         return size / psi

@@ -17,10 +17,10 @@ import numpy as np
 from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.prove import Proof, prove_bound
-from calib_planner.planning.criteria import Compound, Criterion, reported_value
+from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
 from calib_planner.planning.discrepancy import PredictionProblem, choose_for_prediction
 from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
-from calib_planner.planning.problem import POSE_CRITERIA, PlanProblem
+from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import STATUS, Plan, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk

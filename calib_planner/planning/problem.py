@@ -11,14 +11,11 @@ from numpy.typing import ArrayLike
 from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.measurements import Measurements
-from calib_planner.planning.criteria import CRITERIA
+from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA
 from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.feasibility import Constraint
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
-
-POSE_CRITERIA = ("test_pose", "worst_pose")
-"""Criteria that need test poses."""
 
 
 @dataclass(frozen=True, eq=False)

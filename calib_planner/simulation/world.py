@@ -8,7 +8,7 @@ configuration at a time, as a campaign wants it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -100,6 +100,16 @@ class World:
         off = predicted(poses) - self.targets(stand)
         return np.asarray(np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1)))
 
+    def struck(
+        self, stand: Stand, purpose: Purpose, share: float, *which: int
+    ) -> Iterator[tuple[NDArray[np.bool_], np.random.Generator]]:
+        """Of the arrivals in ``stand`` the ``share`` that a fault strikes: rows (n,), and the arrival's draws."""
+        still = np.isfinite(stand.since) & (stand.arrival >= 0)
+        for k in np.unique(stand.arrival[still]) if share > 0 else ():
+            rng = draws(self.seed, purpose, int(k), *which)
+            if rng.random() < share:
+                yield still & (stand.arrival == k), rng
+
     @cached_property
     def _reseated(self) -> Robot:
         truth = self.cell.truth
@@ -109,14 +119,7 @@ class World:
     def _swing(self, stand: Stand) -> FloatArray:
         """(n, 3) what an arm that has not settled adds [m]."""
         f, result = self.faults, np.zeros((len(stand.since), 3))
-        if f.unsettled_probability == 0.0:
-            return result
-        still = np.isfinite(stand.since) & (stand.arrival >= 0)
-        for k in np.unique(stand.arrival[still]):
-            rng = draws(self.seed, Purpose.UNSETTLED, int(k))
-            if rng.random() >= f.unsettled_probability:
-                continue
-            rows = still & (stand.arrival == k)
+        for rows, rng in self.struck(stand, Purpose.UNSETTLED, f.unsettled_probability):
             t, (one, two) = stand.since[rows], directions(rng, 2)
             swing = np.exp(-t / f.oscillation_decay) * np.cos(2 * np.pi * f.oscillation_frequency * t)
             result[rows] = f.oscillation * np.outer(swing, one) + f.creep * np.outer(
@@ -180,14 +183,9 @@ class Sight:
         return result
 
     def _far_standstills(self, target: int, stand: Stand) -> FloatArray:
-        f, result = self.world.faults, np.zeros((len(stand.since), 3))
-        if f.outlier_standstills == 0.0:
-            return result
-        still = np.isfinite(stand.since) & (stand.arrival >= 0)
-        for k in np.unique(stand.arrival[still]):
-            rng = draws(self.world.seed, Purpose.OUTLIER_STANDSTILL, int(k), target)
-            if rng.random() < f.outlier_standstills:
-                result[still & (stand.arrival == k)] = self._far(rng)
+        share, result = self.world.faults.outlier_standstills, np.zeros((len(stand.since), 3))
+        for rows, rng in self.world.struck(stand, Purpose.OUTLIER_STANDSTILL, share, target):
+            result[rows] = self._far(rng)
         return result
 
     def _far(self, rng: np.random.Generator) -> FloatArray:
