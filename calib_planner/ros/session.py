@@ -41,6 +41,7 @@ from calib_planner.io import (
     SessionStore,
     StoredSession,
     calibrated_urdf,
+    make_folder,
     write_estimate,
     write_measurements,
     write_text,
@@ -437,20 +438,14 @@ def confined(folder: str, name: str) -> Path:
     Raises:
         InputError: No folder, or none that can be made; a name that leaves it, or is a link.
     """
-    target = _chosen(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        got = f"{folder} ({error.strerror or error})"
-        raise InputError(FIELD, got, "a folder that can be written to", "choose another folder") from None
-    path = target / name
+    _chosen(folder)
+    path = make_folder(folder, FIELD) / name
     if Path(name).name != name or name in ("", ".", "..") or "\0" in name or path.is_symlink():
         raise InputError(FIELD, brief(str(path), 200), "a file in this folder itself", "move the link away")
     return path
 
 
-def _chosen(folder: str) -> Path:
+def _chosen(folder: str) -> None:
     if not folder:
         advice = "start the node with --ros-args -p save_folder:=FOLDER"
         raise InputError(FIELD, "an empty name", "a folder", advice)
-    return Path(folder).expanduser()
