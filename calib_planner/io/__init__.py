@@ -49,14 +49,14 @@ if TYPE_CHECKING:
         NOT_STORED,
         OUTLIER,
         UNDONE,
-        Journal,
+        CampaignStore,
         Record,
         SessionStore,
         StoredModel,
         StoredSession,
         UnavailableStore,
-        begin_journal,
-        open_journal,
+        begin_campaign,
+        open_campaign,
         open_store,
         stored_model,
     )
@@ -85,8 +85,8 @@ else:
             "prior": "read_prior",
             "sources": "Sources SourceSettings read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
-            "SessionStore Journal Record StoredSession StoredModel UnavailableStore begin_journal "
-            "open_journal open_store stored_model",
+            "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "
+            "open_campaign open_store stored_model",
             "text": "make_folder read_text user_path write_text",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
             "write_calibrated_urdf",

@@ -13,19 +13,24 @@ shared memory, which a full disk could tear. A file of another robot, of a newer
 is refused and left as it is. When the disk is full or gone, ``StoreError`` says so, nothing changes, and the
 next attempt may succeed.
 
-*The journal* of an adaptive campaign, ``campaign_journal.jsonl``: a line of what it is about, then one JSON
-object per event. A line is on the disk before the campaign goes on; the last one may be torn by a crash and is
-then ignored. The state is rebuilt by ``from_measurements``: what was planned and not measured is planned anew.
+*The record of a campaign*, ``adaptive_campaign.sqlite``, has the same tables and a lock of its own, because two
+nodes may share a folder. A campaign is a row of ``campaigns``, its requirements are a row of ``settings``. Its
+measurements are standstills, of which only joints and points are known, with the number under which the
+identifier published them (``told``); the role, fit or validation, is part of the decision. What else happened is
+an event, a JSON object. The state is rebuilt by ``from_measurements``: what was planned and not measured is
+planned anew.
 
-    {"format": …, "campaign": "3f2a…", "robot": …, "joint_names": […], "targets": 1}
-    {"measured": 7, "role": "fit", "configuration": […], "points": [[x, y, z]]}      number of the measurement
-    {"withdrawn": 7}
-    {"excluded": […], "radius": 0.05, "reason": "…", …}
+    {"measured": 7, "role": "fit", "configuration": […], "points": [[x, y, z]]}      a standstill, accepted
+    {"withdrawn": 7}                                  the standstill is undone
     {"joined": true}                                  the validation so far is part of the fit from here on
+    {"excluded": […], "radius": 0.05, "reason": "…", …}
     {"fit_plan": "3f2a…-fit-…", "plan": "{…}"}        the identifier has taken this plan of the fit
     {"finished": "reached"}
 
-Numbers are JSON in both, which Python writes and reads exactly to the bit; null is NaN (a target not seen).
+Earlier versions wrote these objects as lines of ``campaign_journal.jsonl``, below a line of what it is about. It
+is converted when its folder is opened, in one transaction, and then renamed; a torn last line is ignored.
+
+Numbers are JSON, which Python writes and reads exactly to the bit; null is NaN (a target not seen).
 """
 
 from __future__ import annotations
@@ -37,7 +42,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -52,7 +57,6 @@ from calib_planner.campaign import (
     CampaignProblem,
     CampaignState,
     Exclusion,
-    Measurement,
     from_measurements,
 )
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, StoreError
@@ -198,6 +202,7 @@ def _text(values: FloatArray) -> str:
 
 # ── the store ────────────────────────────────────────────────────────────────────────────────────────
 
+CURRENT = "SELECT c.* FROM campaigns AS c JOIN current ON current.campaign = c.number"
 LATEST = """
     SELECT s.*, d.* FROM decisions AS d JOIN standstills AS s ON s.number = d.standstill
     WHERE d.number IN (SELECT MAX(number) FROM decisions WHERE campaign = ? GROUP BY standstill)
@@ -233,6 +238,12 @@ class StoredModel:
         """Hash of the source text."""
         return hashlib.sha256(self.source.encode("utf-8", "surrogatepass")).hexdigest()
 
+    @property
+    def marks(self) -> dict[str, object]:
+        """What tells the robot from another one."""
+        marks = {"robot": self.name, "joint_names": list(self.joint_names), "targets": self.targets}
+        return marks | {"model of the robot, sha256": self.sha256}
+
 
 @dataclass(frozen=True, eq=False)
 class StoredSession:
@@ -250,8 +261,8 @@ class StoredSession:
     records: tuple[Record, ...]
 
 
-class SessionStore:
-    """An open store; ``open_store`` makes one.
+class Store:
+    """An open file of tables, which grow by transactions only.
 
     Attributes:
         path: The file; ``None`` in memory.
@@ -270,6 +281,66 @@ class SessionStore:
         with self._turn:
             self._database.close()
 
+    def history(self, standstill: int) -> list[dict[str, Any]]:
+        """All decisions about a standstill, oldest first: session (key ``campaign``), status, reason, at."""
+        sql = "SELECT campaign, status, reason, at FROM decisions WHERE standstill = ? ORDER BY number"
+        return [dict(r) for r in self._rows(sql, standstill)]
+
+    def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
+        try:
+            with self._turn:
+                return self._database.execute(sql, values).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(self.path, str(error), "check the disk") from None
+
+    def _one(self, sql: str, *values: object) -> Mapping[str, Any] | None:
+        return next(iter(self._rows(sql, *values)), None)
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """One transaction: committed to disk, or as if it had never been."""
+        with self._turn:
+            try:
+                if self.path is not None and identity(self.path) != self._file:
+                    raise StoreError(self.path, "the file was moved, removed or replaced", "put it back")
+                self._database.execute("BEGIN IMMEDIATE")
+                yield self._database
+                self._database.execute("COMMIT")
+            except BaseException as error:
+                with suppress(sqlite3.Error):  # a roll-back that fails is made up for by the next BEGIN
+                    if self._database.in_transaction:  # SQLite may have rolled back itself
+                        self._database.execute("ROLLBACK")
+                self.trouble = str(error)
+                if isinstance(error, sqlite3.Error):
+                    advice = "make space or repair the disk; it is tried again"
+                    raise StoreError(self.path, str(error), advice) from None
+                raise
+            self.trouble = ""
+
+    def _stored_model(self) -> StoredModel | None:
+        row = self._one("SELECT * FROM model")
+        if row is None:
+            return None
+        joints = tuple(json.loads(row["joint_names"]))
+        return StoredModel(row["name"], joints, row["targets"], row["source"], row["origin"])
+
+    def _write_model(self, write: sqlite3.Connection) -> None:
+        model = self.model
+        columns = {"one": 1, "name": model.name, "joint_names": json.dumps(model.joint_names)}
+        columns |= {"targets": model.targets, "origin": model.origin, "sha256": model.sha256}
+        _insert(write, "model", columns | {"source": model.source, "at": _now()})
+
+    def _note_settings(self, settings: Mapping[str, object], version: str) -> None:
+        document = json.dumps(settings, sort_keys=True, default=list)
+        last = self._one("SELECT * FROM settings ORDER BY number DESC LIMIT 1")
+        if last is None or (last["document"], last["version"]) != (document, version):
+            with self._writing() as write:
+                _insert(write, "settings", {"version": version, "document": document, "at": _now()})
+
+
+class SessionStore(Store):
+    """The open store of an identifier; ``open_store`` makes one."""
+
     def current(self) -> StoredSession | None:
         """The session that goes on; ``None`` in a new store.
 
@@ -277,7 +348,7 @@ class SessionStore:
             FileFormatError: Damaged rows.
             StoreError: The file cannot be read now.
         """
-        row = self._one("SELECT c.* FROM campaigns AS c JOIN current ON current.campaign = c.number")
+        row = self._one(CURRENT)
         return None if row is None else self._session(row)
 
     def find(self, plan_id: str, plan: Plan | None) -> StoredSession | None:
@@ -302,11 +373,6 @@ class SessionStore:
     def empty(self) -> bool:
         """Whether nothing was ever recorded."""
         return self._one("SELECT 1 FROM standstills LIMIT 1") is None
-
-    def history(self, standstill: int) -> list[dict[str, Any]]:
-        """All decisions about a standstill, oldest first: session (key ``campaign``), status, reason, at."""
-        sql = "SELECT campaign, status, reason, at FROM decisions WHERE standstill = ? ORDER BY number"
-        return [dict(r) for r in self._rows(sql, standstill)]
 
     def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Record] = ()) -> StoredSession:
         """Make a plan's session the current one: the one there is, or a new one.
@@ -388,45 +454,6 @@ class SessionStore:
         records = tuple(record_of(where, r, joints, targets) for r in rows)
         return StoredSession(row["number"], row["plan_id"], plan_of(where, row["plan"]), records)
 
-    def _rows(self, sql: str, *values: object) -> list[Mapping[str, Any]]:
-        try:
-            with self._turn:
-                return self._database.execute(sql, values).fetchall()
-        except sqlite3.Error as error:
-            raise StoreError(self.path, str(error), "check the disk") from None
-
-    def _one(self, sql: str, *values: object) -> Mapping[str, Any] | None:
-        return next(iter(self._rows(sql, *values)), None)
-
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        """One transaction: committed to disk, or as if it had never been."""
-        with self._turn:
-            yield from self._transaction()
-
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        try:
-            if self.path is not None and identity(self.path) != self._file:
-                raise StoreError(self.path, "the file was moved, removed or replaced", "put it back")
-            self._database.execute("BEGIN IMMEDIATE")
-            yield self._database
-            self._database.execute("COMMIT")
-        except sqlite3.Error as error:
-            self._roll_back()
-            self.trouble = str(error)
-            raise StoreError(self.path, str(error), "make space or repair the disk; it is tried again") from None
-        except BaseException as error:
-            self._roll_back()
-            self.trouble = str(error)
-            raise
-        self.trouble = ""
-
-    def _roll_back(self) -> None:
-        # SQLite may have rolled back itself; a roll-back that fails is made up for by the next BEGIN.
-        with suppress(sqlite3.Error):
-            if self._database.in_transaction:
-                self._database.execute("ROLLBACK")
-
 
 class UnavailableStore(SessionStore):
     """Stands in for a store that cannot be opened at the moment: empty, and nothing can be written."""
@@ -463,14 +490,19 @@ def open_store(
         StoreError: It cannot be opened or written now.
     """
     path = user_path(folder) / FILE if folder else None
-    database = connect(path, field)
+    store = SessionStore(path, connect(path, field), model)
     try:
-        prepare(database, path, field)
-        store = SessionStore(path, database, model)
-        _check_model(store)
-        _note_settings(store, settings, version)
+        stored = store._stored_model()
+        if stored is None or (stored != model and store.empty):
+            with store._writing() as write:
+                for table in ("current", "campaigns", "model"):
+                    write.execute(f"DELETE FROM {table}")
+                store._write_model(write)
+        else:
+            _check_robot(path, stored.marks, model)
+        store._note_settings(settings, version)
     except BaseException:
-        database.close()
+        store.close()
         raise
     return store
 
@@ -484,55 +516,24 @@ def stored_model(folder: str, field: str = "store_folder") -> StoredModel | None
     path = user_path(folder) / FILE
     if not folder or not path.exists():
         return None
-    database = connect(path, field)
+    store = SessionStore(path, connect(path, field), StoredModel("", (), 0, ""))
     try:
-        prepare(database, path, field)
-        store = SessionStore(path, database, StoredModel("", (), 0, ""))
-        row = store._one("SELECT * FROM model")
-        return None if row is None or store.empty else _model_of(row)
+        return None if store.empty else store._stored_model()
     finally:
-        database.close()
+        store.close()
 
 
-def _model_of(row: Mapping[str, Any]) -> StoredModel:
-    joints = tuple(json.loads(row["joint_names"]))
-    return StoredModel(row["name"], joints, row["targets"], row["source"], row["origin"])
-
-
-def _check_model(store: SessionStore) -> None:
-    model, row = store.model, store._one("SELECT * FROM model")
-    stored = None if row is None else _model_of(row)
-    if stored is None or (stored != model and store.empty):
-        with store._writing() as write:
-            write.execute("DELETE FROM current")
-            write.execute("DELETE FROM campaigns")
-            write.execute("DELETE FROM model")
-            columns = {"one": 1, "name": model.name, "joint_names": json.dumps(model.joint_names)}
-            columns |= {"targets": model.targets, "origin": model.origin, "sha256": model.sha256}
-            _insert(write, "model", columns | {"source": model.source, "at": _now()})
-        return
-    compared = {name: (getattr(stored, name), getattr(model, name)) for name in ("joint_names", "targets")}
-    names = {"robot": (stored.name, model.name)}
-    _check_same(store.path, names | compared | {"model of the robot, sha256": (stored.sha256, model.sha256)})
-
-
-def _check_same(path: Path | None, values: Mapping[str, tuple[object, object]]) -> None:
-    """Refuse a file of another robot; ``values`` are what the file says and what the robot says, by name."""
-    for name, (got, expected) in values.items():
-        if got != expected:
+def _check_robot(path: Path | None, written: Mapping[str, object], model: StoredModel) -> None:
+    """Refuse a file of another robot; ``written`` are the marks of the robot that the file names."""
+    for name, got in written.items():
+        if got != model.marks[name]:
             advice = "choose another folder, or start with the robot that the file belongs to"
-            raise FileFormatError(path, name, cut(got, 100), str(expected), advice)
+            raise FileFormatError(path, name, cut(got, 100), str(model.marks[name]), advice)
 
 
-def _note_settings(store: SessionStore, settings: Mapping[str, object], version: str) -> None:
-    document = json.dumps(settings, sort_keys=True, default=list)
-    last = store._one("SELECT * FROM settings ORDER BY number DESC LIMIT 1")
-    if last is None or (last["document"], last["version"]) != (document, version):
-        with store._writing() as write:
-            _insert(write, "settings", {"version": version, "document": document, "at": _now()})
-
-
-def _decide(write: sqlite3.Connection, session: int, standstill: int, record: Record) -> None:
+def _decide(
+    write: sqlite3.Connection, session: int, standstill: int, record: Record, role: str | None = None
+) -> None:
     columns = {
         "campaign": session,
         "standstill": standstill,
@@ -541,6 +542,7 @@ def _decide(write: sqlite3.Connection, session: int, standstill: int, record: Re
         "configuration": record.index,
         "repetition": record.repetition,
         "unused": json.dumps(record.unused),
+        "role": role,
     }
     _insert(write, "decisions", columns | {"at": _now()})
 
@@ -559,6 +561,7 @@ def _now() -> str:
 # ── the file of a store: made, opened for one process alone, checked, and brought up to date ─────────────────
 
 FILE = "campaign.sqlite"
+WRITABLE = "choose a folder that can be written to"
 APPLICATION = 0x43504C53
 """SQLite's mark of whose file it is."""
 MIGRATIONS = (
@@ -583,28 +586,49 @@ MIGRATIONS = (
         configuration INTEGER, repetition INTEGER NOT NULL, unused TEXT NOT NULL, at TEXT NOT NULL);
     CREATE INDEX decisions_of ON decisions (campaign, standstill, number);
     """,
+    """
+    ALTER TABLE standstills ADD COLUMN told INTEGER;
+    ALTER TABLE decisions ADD COLUMN role TEXT;
+    CREATE TABLE events (
+        number INTEGER PRIMARY KEY AUTOINCREMENT, campaign INTEGER NOT NULL REFERENCES campaigns,
+        document TEXT NOT NULL, at TEXT NOT NULL);
+    CREATE INDEX standstills_told ON standstills (told);
+    """,
 )
 """Entry k makes schema k + 1 out of schema k; an empty file is schema 0."""
 
 
-def connect(path: Path | None, field: str) -> sqlite3.Connection:
-    """Open the file, which may be new; ``None``: in memory. Errors are those of ``open_store``."""
+@contextmanager
+def _disk(path: Path | None, advice: str) -> Iterator[None]:
+    """Errors of the operating system and of SQLite become ``StoreError``."""
     try:
+        yield
+    except (OSError, sqlite3.Error) as error:
+        raise StoreError(path, getattr(error, "strerror", None) or str(error), advice) from None
+
+
+def connect(path: Path | None, field: str) -> sqlite3.Connection:
+    """Open the file, which may be new, for this process alone; ``None``: in memory. Errors as ``open_store``."""
+    with _disk(path, WRITABLE):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_symlink():
-                raise FileFormatError(path, field, "a symbolic link", "a file in this folder itself")
+                raise FileFormatError(
+                    path, field, "a symbolic link", "a file in this folder itself", "move it away"
+                )
         # The node is made in one thread and spun in another; only one at a time uses the store.
         name = ":memory:" if path is None else str(path)
         database = sqlite3.connect(name, timeout=1.0, isolation_level=None, check_same_thread=False)
-    except (OSError, sqlite3.Error) as error:
-        advice = "choose a folder that can be written to"
-        raise StoreError(path, getattr(error, "strerror", None) or str(error), advice) from None
     database.row_factory = sqlite3.Row
+    try:
+        _prepare(database, path, field)
+    except BaseException:
+        database.close()
+        raise
     return database
 
 
-def prepare(database: sqlite3.Connection, path: Path | None, field: str) -> None:
+def _prepare(database: sqlite3.Connection, path: Path | None, field: str) -> None:
     """Take the file for this process, check that it is ours and whole, bring its schema up to date."""
     try:
         database.execute("PRAGMA locking_mode = EXCLUSIVE")
@@ -622,8 +646,10 @@ def prepare(database: sqlite3.Connection, path: Path | None, field: str) -> None
         database.execute("PRAGMA synchronous = FULL")
         database.execute("PRAGMA foreign_keys = ON")
         if schema < len(MIGRATIONS):
-            _migrate(database, schema)
-            _settle(path)
+            mark = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {len(MIGRATIONS)};"
+            database.executescript(f"BEGIN IMMEDIATE; {''.join(MIGRATIONS[schema:])} {mark} COMMIT;")
+            if path is not None:
+                _settle(path.parent)
     except sqlite3.OperationalError as error:
         if "locked" in str(error):
             advice = "end the other node or choose another folder"
@@ -636,21 +662,12 @@ def prepare(database: sqlite3.Connection, path: Path | None, field: str) -> None
         raise FileFormatError(path, field, error, "a campaign store that is whole", advice) from None
 
 
-def _migrate(database: sqlite3.Connection, schema: int) -> None:
-    script = "".join(MIGRATIONS[schema:])
-    mark = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {len(MIGRATIONS)};"
-    database.executescript(f"BEGIN IMMEDIATE; {script} {mark} COMMIT;")
-
-
-def _settle(path: Path | None) -> None:
-    """Have the folder know the new file for good."""
-    if path is not None:
-        handle = os.open(path.parent, os.O_RDONLY)
-        try:
-            with suppress(OSError):  # not every file system can
-                os.fsync(handle)
-        finally:
-            os.close(handle)
+def _settle(folder: Path) -> None:
+    """Have the folder know its new file for good."""
+    handle = os.open(folder, os.O_RDONLY)
+    with suppress(OSError):  # not every file system can
+        os.fsync(handle)
+    os.close(handle)
 
 
 def identity(path: Path) -> tuple[int, int] | None:
@@ -662,85 +679,46 @@ def identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-# ── the journal ──────────────────────────────────────────────────────────────────────────────────────
+# ── the record of a campaign ─────────────────────────────────────────────────────────────────────────
 
+CAMPAIGN_FILE = "adaptive_campaign.sqlite"
 JOURNAL = "campaign_journal.jsonl"
 JOURNAL_FORMAT = "calib_planner campaign journal 1"
-JOURNAL_WHAT = "a campaign journal that this package wrote"
+WRITTEN = "the record of a campaign that this package wrote"
 MOST_BYTES = 200_000_000
-WRITABLE = "choose a folder that can be written to"
 
-
-@contextmanager
-def _disk(path: Path, advice: str) -> Iterator[None]:
-    """Errors of the operating system become ``StoreError``."""
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(path, error.strerror or str(error), advice) from None
-
-
-@dataclass(frozen=True, eq=False)
-class Journal:
-    """A file that only grows; made by ``begin_journal`` or ``open_journal``."""
-
-    path: Path
-
-    def note(self, before: CampaignState, after: CampaignState) -> None:
-        """Write what became of ``before``.
-
-        Raises:
-            StoreError: It cannot be written.
-        """
-        lines: list[dict[str, Any]] = []
-        was = [c.role for c in before.configurations]
-        if was != [c.role for c in after.configurations[: len(was)]]:
-            lines.append({"joined": True})
-        now = {r.number: r for r in after.measurements}
-        then = {r.number: r for r in before.measurements}
-        lines += [{"withdrawn": number} for number in then if number not in now]
-        lines += [_row_line(after, r) for number, r in now.items() if then.get(number) is not r]
-        lines += [_exclusion_line(e) for e in after.exclusions[len(before.exclusions) :]]
-        if after.result is not None and before.result is None:
-            lines.append({"finished": after.outcome})
-        self._append(lines)
-
-    def note_plan(self, plan_id: str, plan: Plan) -> None:
-        """Write which plan of the fit the identifier has taken.
-
-        Raises:
-            StoreError: It cannot be written.
-        """
-        self._append([{"fit_plan": plan_id, "plan": plan_text(plan)}])
-
-    def _append(self, lines: list[dict[str, Any]]) -> None:
-        if not lines:
-            return
-        text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines)
-        with _disk(self.path, "make space, then go on"), self.path.open("a", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+WITHDRAW = f"""
+    INSERT INTO decisions (campaign, standstill, status, reason, repetition, unused, at)
+    SELECT ?1, number, '{UNDONE}', '', 0, '[]', ?2 FROM standstills
+    WHERE told = ?3 AND number IN (SELECT standstill FROM decisions WHERE campaign = ?1)
+"""
+JOIN = f"""
+    INSERT INTO decisions (campaign, standstill, status, reason, repetition, unused, at, role)
+    SELECT campaign, standstill, status, reason, repetition, unused, ?2, '{FIT}' FROM decisions
+    WHERE number IN (SELECT MAX(number) FROM decisions WHERE campaign = ?1 GROUP BY standstill)
+    AND status = '{ACCEPTED}'
+"""
 
 
 @dataclass(frozen=True, eq=False)
-class StoredJournal:
-    """What a journal holds.
+class StoredCampaign:
+    """What the record of a campaign holds.
 
     Attributes:
-        journal: The file.
+        store: The open file.
         campaign_id: Name of the campaign.
-        rows: ``(number, role, configuration, points)``.
+        rows: ``(number, role, configuration, points)`` of each measurement in use: (joints,) [rad | m] and
+            (targets, 3) [m], ``None`` where a target was not seen.
         exclusions: Configurations given up.
         finished: The outcome; empty while it is not ended.
         fit_plan: Name and plan of the fit that the identifier took last; ``None`` if there is none that holds the
             validation which joined the fit.
     """
 
-    journal: Journal
+    store: CampaignStore
     campaign_id: str
     rows: tuple[tuple[int, str, list[float], list[Any]], ...] = ()
-    exclusions: tuple[Exclusion, ...] = field(default=())
+    exclusions: tuple[Exclusion, ...] = ()
     finished: str = ""
     fit_plan: tuple[str, Plan] | None = None
 
@@ -752,113 +730,231 @@ class StoredJournal:
         """
         ordered = sorted(self.rows, key=lambda r: r[1] != FIT)
         parts = [[r for r in ordered if (r[1] == FIT) == own] for own in (True, False)]
-        data = [_measurements(problem.robot, part) for part in parts]
+        data = [_measurements(problem.robot.joint_names, part) for part in parts]
         state = from_measurements(problem, data[0], data[1], self.exclusions)
         pairs = zip(state.measurements, ordered, strict=True)
         return replace(state, measurements=tuple(replace(m, number=row[0]) for m, row in pairs))
 
 
-def begin_journal(folder: str | Path, campaign_id: str, robot: Robot) -> Journal:
-    """A new journal in ``folder``, which is made if need be; one that is there is kept beside under its name.
+class CampaignStore(Store):
+    """The open record of a campaign; made by ``begin_campaign`` or ``open_campaign``."""
+
+    def note(self, before: CampaignState, after: CampaignState) -> None:
+        """Write what became of ``before``.
+
+        Raises:
+            StoreError: It cannot be written; nothing was.
+        """
+        events: list[dict[str, Any]] = []
+        was = [c.role for c in before.configurations]
+        if was != [c.role for c in after.configurations[: len(was)]]:
+            events.append({"joined": True})
+        now = {r.number: r for r in after.measurements}
+        then = {r.number: r for r in before.measurements}
+        events += [{"withdrawn": number} for number in then if number not in now]
+        for number, row in now.items():
+            if then.get(number) is not row:
+                event = {"measured": number, "role": after.configurations[row.index].role}
+                events.append(event | {"configuration": row.q.tolist(), "points": plain(row.points)})
+        for e in after.exclusions[len(before.exclusions) :]:
+            event = {"excluded": e.q.tolist(), "radius": e.radius, "reason": e.reason[:LONGEST]}
+            events.append(event | {"asked": e.requested})
+        if after.result is not None and before.result is None:
+            events.append({"finished": after.outcome})
+        if events:
+            with self._writing() as write:
+                self._write(write, events)
+
+    def note_plan(self, plan_id: str, plan: Plan) -> None:
+        """Write which plan of the fit the identifier has taken.
+
+        Raises:
+            StoreError: It cannot be written; nothing was.
+        """
+        with self._writing() as write:
+            self._write(write, [{"fit_plan": plan_id, "plan": plan_text(plan)}])
+
+    def _begin(self, write: sqlite3.Connection, campaign_id: str) -> None:
+        if self._stored_model() is None:
+            self._write_model(write)
+        number = _insert(write, "campaigns", {"plan_id": campaign_id, "at": _now()})
+        write.execute("INSERT OR REPLACE INTO current VALUES (1, ?)", (number,))
+
+    def _write(self, write: sqlite3.Connection, events: Sequence[Mapping[str, Any]]) -> None:
+        """Write events, in the order in which they happened."""
+        campaign = int(write.execute(CURRENT).fetchone()["number"])
+        for event in events:
+            if "measured" in event:
+                told, role = int(event["measured"]), str(event["role"])
+                if role not in (FIT, VALIDATION):
+                    raise InputError("role", cut(role, 100), f"{FIT} or {VALIDATION}")
+                write.execute(WITHDRAW, (campaign, _now(), told))  # what was told before under this number
+                q, points = np.array(event["configuration"], float), np.array(event["points"], float)
+                unknown = np.full(self.model.targets, np.nan)
+                stood = Standstill(0, 0, q, points, unknown, np.zeros(self.model.targets, np.int64))
+                number = _insert(write, "standstills", standstill_row(stood, "") | {"told": told})
+                _decide(write, campaign, number, Record(stood, ACCEPTED, "", None, 0), role)
+            elif "withdrawn" in event:
+                write.execute(WITHDRAW, (campaign, _now(), int(event["withdrawn"])))
+            else:
+                if "joined" in event:
+                    write.execute(JOIN, (campaign, _now()))
+                document = json.dumps(event, allow_nan=False)
+                _insert(write, "events", {"campaign": campaign, "document": document, "at": _now()})
+
+    def _stored(self) -> StoredCampaign | None:
+        """The current campaign; ``None`` if there is none."""
+        current = self._one(CURRENT)
+        if current is None:
+            return None
+        rows: list[tuple[int, str, list[float], list[Any]]] = []
+        path, joints = self.path or "memory", len(self.model.joint_names)
+        sql = "SELECT document FROM events WHERE campaign = ? ORDER BY number"
+        with _readable(path):
+            for row in self._rows(LATEST, current["number"]):
+                if row["status"] == ACCEPTED:
+                    stood = record_of(path, row, joints, self.model.targets).standstill
+                    rows.append((row["told"], row["role"], stood.joints.tolist(), plain(stood.points)))
+            _measurements(self.model.joint_names, rows)  # refuses what is no measurement
+            exclusions, finished, fit_plan = [], "", None
+            for event in (json.loads(row["document"]) for row in self._rows(sql, current["number"])):
+                if "excluded" in event:
+                    q = np.array(event["excluded"], float).reshape(joints)
+                    others = float(event["radius"]), str(event["reason"]), bool(event["asked"])
+                    exclusions.append(Exclusion(-1, q, *others))
+                elif "fit_plan" in event or "joined" in event:
+                    plan = None if "joined" in event else plan_of(path, event["plan"])
+                    fit_plan = None if plan is None else (str(event["fit_plan"]), plan)
+                elif "finished" in event:
+                    finished = str(event["finished"])
+        return StoredCampaign(self, current["plan_id"], tuple(rows), tuple(exclusions), finished, fit_plan)
+
+
+def begin_campaign(
+    folder: str | Path, campaign_id: str, problem: CampaignProblem, version: str, field: str = "store_folder"
+) -> CampaignStore:
+    """A new record in ``folder``, which is made if need be; one that is there is kept beside under another name.
 
     Raises:
+        FileFormatError: A symbolic link stands in its place.
+        InputError: Another process has the one that is there.
         StoreError: It cannot be written.
     """
-    path = user_path(folder) / JOURNAL
+    path = user_path(folder) / CAMPAIGN_FILE
     with _disk(path, WRITABLE):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_symlink():
-            raise StoreError(path, "a symbolic link", "move it away")
         if path.exists():
-            path.rename(path.with_name(f"campaign_journal_before_{campaign_id}.jsonl"))
-    journal = Journal(path)
-    head = {"format": JOURNAL_FORMAT, "campaign": campaign_id, "robot": robot.name}
-    journal._append([head | {"joint_names": list(robot.joint_names), "targets": len(robot.targets)}])
-    return journal
+            try:
+                connect(path, field).close()
+            except FileFormatError:  # what is damaged or foreign is kept as well
+                if path.is_symlink():
+                    raise
+        for name in (CAMPAIGN_FILE, f"{CAMPAIGN_FILE}-wal", JOURNAL):
+            if path.with_name(name).exists():
+                path.with_name(name).rename(path.with_name(f"before_{campaign_id}_{name}"))
+    store = CampaignStore(path, connect(path, field), _model(problem.robot))
+    goals = {f.name: plain(getattr(problem, f.name)) for f in fields(problem)}
+    goals = {name: value for name, value in goals.items() if isinstance(value, (int, float, list))}
+    try:
+        with store._writing() as write:
+            store._begin(write, campaign_id)
+        store._note_settings(goals, version)
+    except BaseException:
+        store.close()
+        raise
+    return store
 
 
-def open_journal(folder: str | Path, robot: Robot) -> StoredJournal | None:
-    """What the journal in ``folder`` holds; ``None`` if there is none.
+def open_campaign(folder: str | Path, robot: Robot, field: str = "store_folder") -> StoredCampaign | None:
+    """What the record in ``folder`` holds; ``None`` if there is none. A journal is converted first.
 
     Raises:
-        FileFormatError: Not a journal, damaged before its last line, or of another robot.
-        StoreError: It cannot be read.
+        FileFormatError: Not such a record, damaged, or of another robot; it was not touched.
+        InputError: Another process has it.
+        StoreError: It cannot be opened or written now.
     """
-    path = user_path(folder) / JOURNAL
+    path = user_path(folder) / CAMPAIGN_FILE
+    journal, model = path.with_name(JOURNAL), _model(robot)
+    lines = _journal_lines(journal, model)
+    new = not path.exists()
+    if new and not lines:
+        return None
+    store = CampaignStore(path, connect(path, field), model)
+    try:
+        stored = store._stored_model()
+        if stored is not None:
+            _check_robot(path, stored.marks, model)
+        if lines:
+            _convert(store, journal, lines)
+        campaign = store._stored()
+        if campaign is None:
+            store.close()
+        return campaign
+    except BaseException:
+        store.close()
+        if new:
+            path.unlink(missing_ok=True)
+        raise
+
+
+def _model(robot: Robot) -> StoredModel:
+    return StoredModel(robot.name, robot.joint_names, len(robot.targets), "")
+
+
+def _measurements(
+    joint_names: tuple[str, ...], rows: Sequence[tuple[int, str, list[float], list[Any]]]
+) -> Measurements | None:
+    if not rows:
+        return None
+    points = np.array([r[3] for r in rows], float)  # None becomes NaN
+    return Measurements(joint_names, np.array([r[2] for r in rows], float), points)
+
+
+@contextmanager
+def _readable(path: str | Path) -> Iterator[None]:
+    """Whatever is wrong with the content is an error of the file."""
+    try:
+        yield
+    except StoreError:
+        raise
+    except (KeyError, TypeError, ValueError, OverflowError, CalibPlannerError) as error:
+        raise FileFormatError(path, "events", cut(error, 200), WRITTEN, "move the file away") from None
+
+
+# ── the journal of earlier versions ──────────────────────────────────────────────────────────────────
+
+
+def _convert(store: CampaignStore, journal: Path, lines: list[dict[str, Any]]) -> None:
+    """Take a journal over, unless that was done before a crash, and rename it."""
+    with _readable(journal):
+        campaign_id = str(lines[0]["campaign"])[:100]
+        known = "SELECT number FROM campaigns WHERE plan_id = ?"
+        if store._one(known, campaign_id) is None:
+            with store._writing() as write:
+                store._begin(write, campaign_id)
+                store._write(write, lines[1:])
+                store._stored()  # refuses what does not fit the robot
+        row = store._one(known, campaign_id)
+    with _disk(journal, WRITABLE):
+        journal.rename(journal.with_name(f"campaign_journal_converted_{row['number'] if row else 0}.jsonl"))
+
+
+def _journal_lines(path: Path, model: StoredModel) -> list[dict[str, Any]]:
+    """The lines of a journal, without a torn last one; empty if there is no journal."""
     with _disk(path, "choose a folder that can be read"):
         if not path.exists():
-            return None
+            return []
         if path.stat().st_size > MOST_BYTES:
             raise FileFormatError(path, "size", f"{path.stat().st_size} bytes", f"at most {MOST_BYTES}")
         whole = path.read_bytes()
-    end = whole.rfind(b"\n") + 1
-    if end < len(whole):
-        with _disk(path, WRITABLE):  # or the next line would be written behind a torn one
-            os.truncate(path, end)
-    lines = [_parsed(path, number, line) for number, line in enumerate(whole[:end].splitlines(), 1)]
+    lines: list[dict[str, Any]] = []
+    for number, line in enumerate(whole[: whole.rfind(b"\n") + 1].splitlines(), 1):
+        event = None
+        with suppress(ValueError, RecursionError):
+            event = json.loads(line)
+        if not isinstance(event, dict):
+            raise FileFormatError(path, f"line {number}", ascii(line[:40]), WRITTEN, "move the file away")
+        lines.append(event)
     if not lines or lines[0].get("format") != JOURNAL_FORMAT:
-        raise FileFormatError(path, "line 1", "something else", JOURNAL_WHAT, "move the file away")
-    robots = {"robot": robot.name, "joint_names": list(robot.joint_names), "targets": len(robot.targets)}
-    _check_same(path, {name: (lines[0].get(name), own) for name, own in robots.items()})
-    try:
-        return _folded(Journal(path), lines, robot)
-    except (KeyError, TypeError, ValueError, OverflowError, CalibPlannerError) as error:
-        raise FileFormatError(path, "events", cut(error, 200), JOURNAL_WHAT, "move the file away") from None
-
-
-def _folded(journal: Journal, lines: list[dict[str, Any]], robot: Robot) -> StoredJournal:
-    rows: dict[int, tuple[int, str, list[float], list[Any]]] = {}
-    exclusions: list[Exclusion] = []
-    finished = ""
-    fit_plan: tuple[str, Plan] | None = None
-    for line in lines[1:]:
-        if "measured" in line:
-            number, role = int(line["measured"]), str(line["role"])
-            if role not in (FIT, VALIDATION):
-                raise InputError("role", cut(role, 100), f"{FIT} or {VALIDATION}")
-            rows[number] = (number, role, list(line["configuration"]), list(line["points"]))
-        elif "withdrawn" in line:
-            rows.pop(int(line["withdrawn"]), None)
-        elif "excluded" in line:
-            q = np.array(line["excluded"], float).reshape(len(robot.joint_names))
-            exclusions.append(Exclusion(-1, q, float(line["radius"]), str(line["reason"]), bool(line["asked"])))
-        elif "joined" in line:
-            rows = {n: (n, FIT, q, points) for n, (_, _, q, points) in rows.items()}
-            fit_plan = None
-        elif "fit_plan" in line:
-            plan = plan_of(journal.path, line["plan"])
-            fit_plan = None if plan is None else (str(line["fit_plan"]), plan)
-        elif "finished" in line:
-            finished = str(line["finished"])
-    for row in rows.values():
-        _measurements(robot, [row])  # refuses what does not fit the robot
-    return StoredJournal(
-        journal, str(lines[0]["campaign"])[:100], tuple(rows.values()), tuple(exclusions), finished, fit_plan
-    )
-
-
-def _measurements(robot: Robot, rows: list[tuple[int, str, list[float], list[Any]]]) -> Measurements | None:
-    if not rows:
-        return None
-    points = np.array([r[3] for r in rows], float)  # null becomes NaN
-    if points.shape[1:] != (len(robot.targets), 3):
-        raise InputError("points", points.shape[1:], f"({len(robot.targets)}, 3), as the robot has targets")
-    return Measurements(robot.joint_names, np.array([r[2] for r in rows], float), points)
-
-
-def _row_line(state: CampaignState, row: Measurement) -> dict[str, Any]:
-    role = state.configurations[row.index].role
-    return {"measured": row.number, "role": role, "configuration": row.q.tolist(), "points": plain(row.points)}
-
-
-def _exclusion_line(out: Exclusion) -> dict[str, Any]:
-    return {"excluded": out.q.tolist(), "radius": out.radius, "reason": out.reason[:500], "asked": out.requested}
-
-
-def _parsed(path: Path, number: int, line: bytes) -> dict[str, Any]:
-    event = None
-    with suppress(ValueError, RecursionError):
-        event = json.loads(line)
-    if not isinstance(event, dict):
-        raise FileFormatError(path, f"line {number}", ascii(line[:40]), JOURNAL_WHAT, "move the file away")
-    return event
+        raise FileFormatError(path, "line 1", "something else", WRITTEN, "move the file away")
+    _check_robot(path, {name: lines[0].get(name) for name in ("robot", "joint_names", "targets")}, model)
+    return lines

@@ -15,7 +15,7 @@ from stores import MODEL, assert_same, begun, decision, opened, standstill
 from calib_planner import Plan, Robot
 from calib_planner.acquisition import Rejection, RejectionReason, Standstill
 from calib_planner.errors import FileFormatError, InputError, StoreError
-from calib_planner.io import LONGEST, SessionStore, StoredModel, UnavailableStore, open_journal, stored_model
+from calib_planner.io import LONGEST, SessionStore, StoredModel, UnavailableStore, open_campaign, stored_model
 from calib_planner.io import store as store_file
 from calib_planner.io.store import FILE, MIGRATIONS
 
@@ -235,7 +235,7 @@ def test_an_older_schema_is_brought_up_to_date(tmp_path: Path, monkeypatch: pyte
     assert found is not None and len(found.records) == 1
     store._one("SELECT note FROM standstills")
     store.close()
-    assert sqlite3.connect(tmp_path / FILE).execute("PRAGMA user_version").fetchone() == (2,)
+    assert sqlite3.connect(tmp_path / FILE).execute("PRAGMA user_version").fetchone() == (len(more),)
 
 
 def test_a_file_of_another_program_is_refused(tmp_path: Path) -> None:
@@ -326,7 +326,8 @@ def test_a_folder_of_the_version_before_is_read_whole(tmp_path: Path) -> None:
     assert store.record(found.number, decision(standstill(4))) == 4
     store.close()
 
-    stored = open_journal(tmp_path, Robot.load("planar_2r"))
+    journal = (tmp_path / "campaign_journal.jsonl").read_bytes()
+    stored = open_campaign(tmp_path, Robot.load("planar_2r"))
     assert stored is not None and stored.campaign_id == "abc" and not stored.finished
     assert [(number, role) for number, role, *_ in stored.rows] == [(11, "fit"), (14, "fit"), (15, "validation")]
     q, points = (
@@ -338,3 +339,8 @@ def test_a_folder_of_the_version_before_is_read_whole(tmp_path: Path) -> None:
     assert [(e.q.tolist(), e.reason, e.requested) for e in stored.exclusions] == [
         (q[2].tolist(), "a wall", False)
     ]
+    assert [row["status"] for row in stored.store.history(2)] == ["accepted", "undone"]
+    stored.store.close()
+    files = {f.name for f in tmp_path.iterdir()}
+    assert files == {FILE, "adaptive_campaign.sqlite", "campaign_journal_converted_1.jsonl"}
+    assert (tmp_path / "campaign_journal_converted_1.jsonl").read_bytes() == journal

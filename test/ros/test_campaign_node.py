@@ -20,8 +20,9 @@ from geometry_msgs.msg import Point
 from rclpy.parameter import Parameter
 
 from calib_planner import Robot
-from calib_planner.io import read_estimate, read_measurements
-from calib_planner.io.store import JOURNAL as FILE
+from calib_planner.io import open_campaign, read_estimate, read_measurements
+from calib_planner.io.store import CAMPAIGN_FILE as FILE
+from calib_planner.io.store import JOURNAL
 from calib_planner.ros import campaign as campaign_measuring
 from calib_planner.ros.messages import estimate_from_message
 from calib_planner.ros.nodes import campaign as campaign_node
@@ -328,7 +329,7 @@ def test_undone_measurements_are_made_again_and_nonsense_is_refused(bench: Bench
 # ── restarts ─────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_it_goes_on_from_its_journal(bench: Bench, cell: FakeCell, tmp_path: Path) -> None:
+def test_it_goes_on_from_its_store(bench: Bench, cell: FakeCell, tmp_path: Path) -> None:
     cell.answer = lambda q: "hang" if len(cell.visited) == 6 else "ok"
     desk = Desk(bench, store_folder=str(tmp_path))
     assert desk.call("start")[0]
@@ -337,8 +338,8 @@ def test_it_goes_on_from_its_journal(bench: Bench, cell: FakeCell, tmp_path: Pat
     rows = desk.node.campaign.measurements
     for step in ("deactivate", "cleanup"):
         getattr(desk.node, f"trigger_{step}")()
-    with (tmp_path / FILE).open("a") as file:
-        file.write('{"measured": 77, "role": "fi')  # what a crash leaves of a line
+    assert not (tmp_path / f"{FILE}-wal").exists()
+    (tmp_path / f"{FILE}-wal").write_bytes(b"\x37\x7f\x06\x82" + bytes(4000))  # what a crash leaves of a write
     desk.node.trigger_configure()
     desk.node.trigger_activate()
     again = desk.until(S.PAUSED, measured=5)
@@ -353,13 +354,15 @@ def test_it_goes_on_from_its_journal(bench: Bench, cell: FakeCell, tmp_path: Pat
     done = desk.until(S.DONE)
     assert done.outcome == S.OUTCOME_REACHED and done.campaign_id == before.campaign_id
     assert len(cell.visited) - visited == done.measured + done.validated - 5
-    lines = [json.loads(line) for line in (tmp_path / FILE).read_text().splitlines()]
-    assert lines[-1] == {"finished": "reached"} and sum("measured" in x for x in lines) == done.measured + 3
+    stored = open_campaign(tmp_path, Robot.load("planar_2r"))
+    assert stored is not None
+    stored.store.close()
+    assert stored.finished == "reached" and len(stored.rows) == done.measured + 3
 
 
 def test_a_journal_of_another_robot_is_left_alone(bench: Bench, tmp_path: Path) -> None:
     head = {"format": "calib_planner campaign journal 1", "campaign": "x", "robot": "other"}
-    (tmp_path / FILE).write_text(json.dumps(head | {"joint_names": ["a"], "targets": 1}) + "\n")
+    (tmp_path / JOURNAL).write_text(json.dumps(head | {"joint_names": ["a"], "targets": 1}) + "\n")
     desk = Desk(bench, store_folder=str(tmp_path))
     assert desk.now.state == S.IDLE and "planar_2r" in desk.now.reason and "other" in desk.now.reason
 

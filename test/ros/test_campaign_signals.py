@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,8 @@ from bench import Bench
 from desk import ASKED, Desk, S
 from fake_cell import FakeCell
 
-from calib_planner.io.store import JOURNAL as FILE
+from calib_planner import Robot
+from calib_planner.io import open_campaign
 from calib_planner.ros.processes import Nodes
 
 NODE = "campaign_node"
@@ -41,9 +41,11 @@ class Restarts:
         assert "Traceback" not in self.log and "Error" not in self.log, self.log
 
     def measured(self) -> list[int]:
-        """Numbers of the measurements in the journal; every line of it is whole."""
-        lines = [json.loads(line) for line in (self.folder / "store" / FILE).read_text().splitlines()]
-        return [line["measured"] for line in lines if "measured" in line]
+        """Numbers of the measurements in the store, which is whole and which no process holds any more."""
+        stored = open_campaign(self.folder / "store", Robot.load("planar_2r"))
+        assert stored is not None
+        stored.store.close()
+        return [number for number, *_ in stored.rows]
 
 
 @pytest.fixture

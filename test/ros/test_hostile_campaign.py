@@ -29,7 +29,8 @@ from std_srvs.srv import Trigger
 from test_hostile_peer import BIG, PATHS, text_parameter, urdfs
 
 from calib_planner.errors import InputError
-from calib_planner.io.store import JOURNAL as FILE
+from calib_planner.io.store import CAMPAIGN_FILE as FILE
+from calib_planner.io.store import JOURNAL
 from calib_planner.io.store import JOURNAL_FORMAT as FORMAT
 from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.parameters import EVENTS, LATCHED
@@ -115,7 +116,7 @@ class Attack:
         assert len(self.desk.now.reason) <= 1000
         assert [p.name for p in self.outside.iterdir()] == ["secret.txt"]
         assert {p.name for p in self.folder.iterdir()} == {"outside", "store"}
-        assert [p.name for p in (self.folder / "store").iterdir()] == [FILE]
+        assert {p.name for p in (self.folder / "store").iterdir()} == {FILE, f"{FILE}-wal"}
         assert not any("secret" in line.msg or "Traceback" in line.msg for line in self.logs)
 
 
@@ -319,21 +320,24 @@ JOURNALS: dict[str, list[Any]] = {
 @pytest.mark.parametrize("case", JOURNALS)
 def test_a_journal_that_is_none_is_left_alone(bench: Bench, tmp_path: Path, case: str) -> None:
     lines = [x if isinstance(x, str) and x.startswith("[") else json.dumps(x) for x in JOURNALS[case]]
-    (tmp_path / FILE).write_text("\n".join(lines) + "\n")
-    before = (tmp_path / FILE).read_bytes()
+    (tmp_path / JOURNAL).write_text("\n".join(lines) + "\n")
+    before = (tmp_path / JOURNAL).read_bytes()
     desk = Desk(bench, store_folder=str(tmp_path))
     assert desk.node.is_active and "cannot go on" in desk.now.reason and len(desk.now.reason) <= 1000
-    assert (tmp_path / FILE).read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == [JOURNAL] and (tmp_path / JOURNAL).read_bytes() == before
 
 
 def test_a_campaign_whose_name_leaves_the_folder_writes_nothing_there(bench: Bench, tmp_path: Path) -> None:
     store = tmp_path / "a" / "store"
     store.mkdir(parents=True)
-    (store / FILE).write_text(json.dumps(HEAD | {"campaign": "/../../../escaped"}) + "\n")
+    (store / JOURNAL).write_text(json.dumps(HEAD | {"campaign": "/../../../escaped"}) + "\n")
     bench.start(FakeCell)
     desk = Desk(bench, elsewhere=True)
     desk.node = bench.start(CampaignNode, **(ASKED | {"store_folder": str(store)}))
     bench.wait(lambda: desk.call("pause")[0])
     assert desk.call("resume")[0]
     assert "were not written" in desk.until(S.DONE, 60.0).reason
-    assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()] == [f"a/store/{FILE}"]
+    names = {FILE, "campaign_journal_converted_1.jsonl"}
+    assert {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()} == {
+        f"a/store/{n}" for n in names
+    }

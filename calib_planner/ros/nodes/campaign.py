@@ -7,7 +7,7 @@ accepted. The identifier has to keep its measurements when a plan comes (``keep_
 fit holds everything that was measured before. The plan of the validation holds the validation only; after it the
 plan of the fit is announced again, so that in the end the identifier's own estimate, too, is that of the fit.
 When a validation joins the fit, the identifier has to take a plan of the fit that holds it before the next
-validation is announced. The journal keeps the plan of the fit that was taken, so that after a restart the same
+validation is announced. The store keeps the plan of the fit that was taken, so that after a restart the same
 plan is announced again.
 
 The robot is sent nowhere before ``~/start``, nor after a restart before ``~/resume``. All callbacks take turns in
@@ -27,6 +27,7 @@ from calib_planner_msgs.msg import Plan as PlanMessage
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
+from calib_planner import __version__
 from calib_planner.campaign import (
     CampaignResult,
     CampaignState,
@@ -38,7 +39,7 @@ from calib_planner.campaign import (
     decide,
 )
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
-from calib_planner.io import Journal, begin_journal, open_journal
+from calib_planner.io import CampaignStore, begin_campaign, open_campaign
 from calib_planner.ros.campaign import (
     Measuring,
     idle_status,
@@ -74,14 +75,21 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._ending_plan = threading.Event()
         self._work: Future[NextStep] | None = None
         self._work_for = ""
+        self._store: CampaignStore | None = None
         self._forget()
         super().__init__("calibration_campaign", CampaignParameters(), context, overrides)
 
     def _forget(self) -> None:
         self.campaign: CampaignState | None = None
-        self._journal: Journal | None = None
+        self._let_go()
         self._id, self._reason, self._sent = "", "call ~/start", ""
         self._reported = False
+
+    def _let_go(self) -> None:
+        """Close the campaign's file."""
+        if self._store is not None:
+            self._store.close()
+        self._store = None
 
     def configure(self) -> None:
         """Load the robot, offer services, listen."""
@@ -122,10 +130,11 @@ class CampaignNode(ManagedNode[CampaignParameters]):
     def close(self) -> bool:
         """End everything; returns whether the search of a plan ended in time."""
         super().close()
+        self._let_go()
         return self._work is None
 
     def _go_on_with_stored(self) -> None:
-        """Load the campaign of the journal, paused, so that no robot moves unexpectedly."""
+        """Load the campaign of the store, paused, so that no robot moves unexpectedly."""
         chosen, model = self.settings.value, self._source.model
         if self.campaign is not None or not chosen.store_folder or not isinstance(model, Model):
             return
@@ -133,15 +142,20 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             return
         try:
             problem = problem_of(chosen, model)
-            stored = open_journal(chosen.store_folder, problem.robot)
-            if stored is None or stored.finished:
+            stored = open_campaign(chosen.store_folder, problem.robot)
+            if stored is None:
+                return
+            self._store = stored.store
+            if stored.finished:
+                self._let_go()
                 return
             self.campaign = stored.state(problem).pause()
         except CalibPlannerError as error:
+            self._let_go()
             self._reason = f"the campaign in the store cannot go on: {error}"
             self.get_logger().error(self._reason)
             return
-        self._id, self._journal = stored.campaign_id, stored.journal
+        self._id = stored.campaign_id
         self._measuring.begin(self._id, stored.fit_plan)
         self._reason = f"{len(stored.rows)} measurements of campaign {self._id} are there: call ~/resume to go on"
 
@@ -162,9 +176,11 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         problem = problem_of(self.settings.value, self._source.model)
         folder = self.settings.value.store_folder
         name = uuid.uuid4().hex[:12]
-        journal = begin_journal(folder, name, problem.robot) if folder else None
+        if self._store is not None:
+            self._store.close()  # the new campaign takes its place; if that fails, the next measurement says so
+        store = begin_campaign(folder, name, problem, __version__) if folder else None
         self._forget()
-        self._id, self._journal, self.campaign = name, journal, begin(problem)
+        self._id, self._store, self.campaign = name, store, begin(problem)
         self._measuring.begin(name)
         self._reason = ""
         where = f"stored in {folder}" if folder else "in memory only: set store_folder to store it"
@@ -219,18 +235,18 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         before = self.campaign
         if before is state:
             return
-        if before is not None and not self._stored(lambda journal: journal.note(before, state)):
+        if before is not None and not self._stored(lambda store: store.note(before, state)):
             state = state.pause()
         self.campaign = state
 
-    def _stored(self, write: Callable[[Journal], None]) -> bool:
-        """Write to the journal, if there is one; ``False`` if that failed: then there is none any more."""
-        if self._journal is None:
+    def _stored(self, write: Callable[[CampaignStore], None]) -> bool:
+        """Write to the store, if there is one; ``False`` if that failed: then there is none any more."""
+        if self._store is None:
             return True
         try:
-            write(self._journal)
+            write(self._store)
         except StoreError as error:
-            self._journal = None
+            self._let_go()
             self._reason = f"paused: not stored any more, {error}; ~/resume goes on without storing"
             self.get_logger().error(self._reason)
             return False
@@ -249,7 +265,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             before = measuring.fit
             self._set(measuring.step(state, action))
             new = None if measuring.fit is before else measuring.fit
-            if new is not None and not self._stored(lambda journal: journal.note_plan(new.plan_id, new.plan)):
+            if new is not None and not self._stored(lambda store: store.note_plan(new.plan_id, new.plan)):
                 self._set(state.pause())
             if measuring.waited > self.settings.value.longest_wait:
                 self._pause_for(f"{measuring.waiting}; call ~/resume once that is remedied")
@@ -287,6 +303,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         if self._reported:
             return
         self._reported = True
+        self._let_go()
         self.get_logger().info(f"{result.outcome}: {result.message}")
         for reason in reasons_of(result.verdict) or [result.verdict.level]:
             self.get_logger().info(reason)
