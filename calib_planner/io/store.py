@@ -687,10 +687,9 @@ JOURNAL_FORMAT = "calib_planner campaign journal 1"
 WRITTEN = "the record of a campaign that this package wrote"
 MOST_BYTES = 200_000_000
 
-WITHDRAW = f"""
-    INSERT INTO decisions (campaign, standstill, status, reason, repetition, unused, at)
-    SELECT ?1, number, '{UNDONE}', '', 0, '[]', ?2 FROM standstills
-    WHERE told = ?3 AND number IN (SELECT standstill FROM decisions WHERE campaign = ?1)
+TOLD = """
+    SELECT MAX(s.number) FROM standstills AS s JOIN decisions AS d ON d.standstill = s.number
+    WHERE d.campaign = ? AND s.told = ?
 """
 JOIN = f"""
     INSERT INTO decisions (campaign, standstill, status, reason, repetition, unused, at, role)
@@ -784,19 +783,20 @@ class CampaignStore(Store):
         """Write events, in the order in which they happened."""
         campaign = int(write.execute(CURRENT).fetchone()["number"])
         for event in events:
+            if "measured" in event or "withdrawn" in event:  # a number told again replaces the former measurement
+                told = int(event["measured"] if "measured" in event else event["withdrawn"])
+                former = write.execute(TOLD, (campaign, told)).fetchone()[0]
+                write.execute(WITHDRAW, (UNDONE, "", _now(), former))
             if "measured" in event:
-                told, role = int(event["measured"]), str(event["role"])
+                role = str(event["role"])
                 if role not in (FIT, VALIDATION):
                     raise InputError("role", cut(role, 100), f"{FIT} or {VALIDATION}")
-                write.execute(WITHDRAW, (campaign, _now(), told))  # what was told before under this number
                 q, points = np.array(event["configuration"], float), np.array(event["points"], float)
                 unknown = np.full(self.model.targets, np.nan)
                 stood = Standstill(0, 0, q, points, unknown, np.zeros(self.model.targets, np.int64))
                 number = _insert(write, "standstills", standstill_row(stood, "") | {"told": told})
                 _decide(write, campaign, number, Record(stood, ACCEPTED, "", None, 0), role)
-            elif "withdrawn" in event:
-                write.execute(WITHDRAW, (campaign, _now(), int(event["withdrawn"])))
-            else:
+            elif "withdrawn" not in event:
                 if "joined" in event:
                     write.execute(JOIN, (campaign, _now()))
                 document = json.dumps(event, allow_nan=False)
