@@ -21,7 +21,7 @@ from calib_planner.cli.arguments import (
     switch,
 )
 from calib_planner.cli.terminal import Terminal
-from calib_planner.compensation import STATUS, Compensation, compensate
+from calib_planner.compensation import STATUS, Compensation, Corrections, compensate
 from calib_planner.errors import InputError
 from calib_planner.io import calibrated_robot, format_table, read_configurations, read_estimate, write_text
 from calib_planner.robot import Robot
@@ -34,7 +34,8 @@ DESCRIPTION = """Correct joint targets so that the real tool goes where the nomi
 The CSV of targets has a column per joint [rad | m], in any order. What is written has the same rows: the
 corrected joints [rad | m], what remains (position_error [m], rotation_error [rad]), and reached: 1, or 0 where
 the row could not be reached exactly and is the closest there is. Joint limits are respected. Where the base
-stands before the tracker plays no part. Joint corrections that the estimate holds are applied."""
+stands before the tracker plays no part. Joint corrections, or the gravity and joint functions of an error model,
+that the estimate holds are applied."""
 
 ERRORS = ("position_error", "rotation_error", "reached")
 
@@ -49,7 +50,7 @@ def add(commands: Commands, summary: str) -> None:
     switch(what, "--position-only", "only the position of a point counts, not how the tool is turned")
     text = "that point, in the frame of the last link [m] (the first reflector, as identified)"
     option(what, "--tool", '"x y z"', text, kind=numbers)
-    text = "leave out the joint corrections that the estimate may hold: what a calibrated URDF does"
+    text = "leave out the errors of the joints that the estimate may hold: what a calibrated URDF does"
     switch(what, "--geometry-only", text)
     switch(what, "--ignore-limits", "joint limits do not matter")
     add_seed(parser)
@@ -59,8 +60,13 @@ def add(commands: Commands, summary: str) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     nominal = load_robot(args)
     saved = read_estimate(args.estimate)
-    learnt = None if args.geometry_only else saved.joint_corrections
-    calibrated = calibrated_robot(nominal, saved) if learnt is None else saved.complete(nominal)
+    corrections, learnt = saved.joint_corrections, saved.learnt
+    calibrated: Robot = calibrated_robot(nominal, saved)
+    errors: Corrections | None = None
+    if not args.geometry_only and learnt is not None:
+        calibrated, errors = saved.calibrated(nominal), saved.knowledge(nominal)
+    elif not args.geometry_only and corrections is not None:
+        calibrated, errors = saved.complete(nominal), corrections.corrections
     if args.position_only and args.tool is None and saved.targets is not None:
         # The same point of the tool on both robots: a nominal place of a reflector is no more than a guess.
         nominal, calibrated = nominal.with_targets(saved.targets), calibrated.with_targets(saved.targets)
@@ -74,7 +80,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             q,
             position_only=args.position_only,
             limits=not args.ignore_limits,
-            corrections=None if learnt is None else learnt.corrections,
+            corrections=errors,
         )
     if args.output:
         write_text(args.output, _csv(result), "--output")
@@ -84,7 +90,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         "robot": nominal.name,
         **result.to_dict(),
         "position_only": args.position_only,
-        "joint_corrections": learnt is not None,
+        "joint_corrections": errors is not None and learnt is None,
+        **({} if learnt is None else {"error_model": errors is not None}),
         "output": args.output,
     }
     if args.json:

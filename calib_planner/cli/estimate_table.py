@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from calib_planner.identification import Estimate, NoiseLevels, Validation
+from calib_planner.identification import Estimate, Learnt, NoiseLevels, Validation
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import is_nuisance
 from calib_planner.units import length, milli, milliradians, signed
@@ -32,6 +32,15 @@ SOURCES = {
     "repetitions": "from repetitions",
     "residuals": "from the residuals",
 }
+MEANINGS = {
+    "placement": "lengths, axes and zeros of the chain, base and targets: what a URDF can hold",
+    "gravity": "joints that give way under the weight of the arm",
+    "smooth": "gears and encoders: errors of a few waves a turn of a joint",
+    "short": "gears and encoders: errors that change within some degrees of a joint",
+    "visits": "repeatability of the robot, new each time that it comes to a configuration",
+    "points": "noise of the instrument and of each point",
+}
+"""Term of the error model → what it means."""
 HEADINGS = ("count", "mean before", "mean after", "median", "rms", "max", "rms predicted", "in 95 %")
 MOST_POINTS = 10
 MOST_COMBINATIONS = 8
@@ -43,6 +52,8 @@ def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], s
     _show_verdict(estimate, console)
     console.print(_distances(estimate))
     console.print(_noise(estimate), soft_wrap=True)
+    if estimate.error_model is not None:
+        console.print(_terms(estimate.error_model))
     if len(estimate.accuracy.test_poses):
         console.print(_accuracy(estimate), soft_wrap=True)
     console.print(_counts(estimate), soft_wrap=True)
@@ -83,11 +94,15 @@ def _distances(estimate: Estimate) -> Table:
     label = "fitted" if estimate.transmission is None else "fitted, geometry"
     cells = [milli(before.mean), milli(after.mean), "", milli(after.rms), milli(after.max)]
     table.add_row(label, str(estimate.points.used), *cells)
+    if estimate.error_model is not None:
+        left = estimate.error_model.left_out
+        lengths = [milli(v) for v in (left.rms, left.max, left.predicted_rms)]
+        table.add_row("left out, visit by visit", str(left.count), "", milli(left.mean), "", *lengths, "")
     for result in (estimate.cross_validation, estimate.validation):
         if result is not None:
             label = f"left out, {result.folds} folds" if result.folds else "held out"
             table.add_row(label, str(result.count), *_held_out(result))
-            if estimate.transmission is not None:
+            if estimate.transmission is not None or estimate.error_model is not None:
                 table.add_row(
                     "… geometry alone", "", "", milli(result.geometry_mean), "", milli(result.geometry_rms)
                 )
@@ -100,11 +115,27 @@ def _held_out(v: Validation) -> list[str]:
     return [*(milli(v) for v in lengths), inside]
 
 
+def _terms(learnt: Learnt) -> Table:
+    """How large each term is at the measured points, and what it means."""
+    table = Table(title="error model: what moves the measured points, rms [mm]")
+    for heading in ("term", "size", "± std", "gain", "what it means"):
+        table.add_column(heading, justify="left" if heading in ("term", "what it means") else "right")
+    for term in learnt.terms:
+        size = milli(term.size) if term.kept else "left out"
+        std = milli(term.std) if np.isfinite(term.std) else ""
+        gain = f"{term.gain:+.1f}" if np.isfinite(term.gain) else ""
+        table.add_row(term.name, size, std, gain, MEANINGS[term.name], style="" if term.kept else "dim")
+    table.caption = "gain: log score of visits predicted from the others, with the term less without it"
+    return table
+
+
 def _noise(estimate: Estimate) -> str:
     """Measurement noise and what no geometric model holds, in one line."""
     noise = estimate.noise
     if not np.isfinite(noise.measurement):
         return "Noise: unknown, nothing is redundant."
+    if estimate.error_model is not None:
+        return f"Noise per coordinate of a point: {length(noise.measurement)} ({SOURCES[noise.source]})."
     scaled = f", raised {noise.scaled:.2g} times by repetitions" if noise.scaled > 1 else ""
     text = f"Noise per coordinate: measurement {length(noise.measurement)} ({SOURCES[noise.source]}{scaled})"
     if noise.repeat_freedom and noise.source != "repetitions":
@@ -135,6 +166,8 @@ def _accuracy(estimate: Estimate) -> str:
     if np.isfinite(own).all():
         parts = [length(float(np.sqrt(np.mean(v**2)))) for v in (own, rest)]
         text += f" (parameters, ρ0: {parts[0]}; beyond the model: {parts[1]})"
+    if estimate.error_model is not None and estimate.error_model.frame == "robot":
+        text += ", up to a new registration of the robot"
     required = estimate.accuracy.required
     return text + (f"; required: {length(required)}" if np.isfinite(required) else "")
 

@@ -32,8 +32,10 @@ from calib_planner.cli.estimate_table import show_estimate
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, NotEnoughDataError
 from calib_planner.identification import (
+    ACCURACIES,
     AUTOMATIC,
     LOSSES,
+    WITHOUT_MODEL,
     Estimate,
     IdentificationProblem,
     Prior,
@@ -48,6 +50,7 @@ from calib_planner.io import (
     SourceSettings,
     is_bag,
     placement,
+    read_error_model,
     read_instrument,
     read_prior,
     read_source,
@@ -93,6 +96,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     if args.validate_target_from and not args.validate:
         raise InputError("--validate-target-from", args.validate_target_from, "--validate FILE beside it")
     check_files(args)
+    check_error_model(args)
     robot = load_robot(args)
     check_outputs(args, robot)
     settings = source_settings(args, terminal)
@@ -129,6 +133,8 @@ def _problem(
         joint_corrections=args.joint_corrections,
         starts=args.starts,
         required_accuracy=args.required_accuracy,
+        error_model=None if args.error_model is None else read_error_model(args.error_model),
+        accuracy_frame=args.accuracy_frame or "world",
     )
 
 
@@ -257,6 +263,11 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
     text = "auto: residuals beyond the noise count as errors that no geometric model holds; off: they do not"
     option(group, "--discrepancy", None, text, DEFAULTS["discrepancy"], choices=AUTOMATIC)
     add_joint_corrections(group, AUTOMATIC)
+    text = (
+        "typical, paper (noise alone), or YAML, also an estimate: gravity, joint functions and repeatability are "
+    )
+    text += "estimated with the parameters, and every visit is predicted from the others (none)"
+    option(group, "--error-model", "E", text)
     option(group, "--iterations", "N", "largest number of iterations", DEFAULTS["iterations"])
     option(group, "--starts", "N", "number of other starts, which find other minima", DEFAULTS["starts"])
 
@@ -275,6 +286,11 @@ def add_checks(parser: argparse.ArgumentParser) -> None:
     """How good it is and has to be."""
     check = parser.add_argument_group("how good is it")
     add_test_poses(check, "where the predicted accuracy is wanted")
+    text = (
+        "world: in the frame of the points; robot: up to a new registration of the robot, at four test poses or "
+    )
+    text += "more; needs --error-model (world)"
+    option(check, "--accuracy-frame", None, text, choices=ACCURACIES)
     text = "largest error that is acceptable at a test pose [m] (not checked)"
     option(check, "--required-accuracy", "A", text, kind=float)
     option(check, "--validate", "FILE", "held-out CSV or bag; repeat for several", action="append")
@@ -283,6 +299,23 @@ def add_checks(parser: argparse.ArgumentParser) -> None:
     text = "cross-validation: leave out each of K parts of --data in turn (none)"
     option(check, "--folds", "K", text, kind=int)
     add_seed(check)
+
+
+def check_error_model(args: argparse.Namespace) -> None:
+    """Refuse options that an error model has no use for, or that need one.
+
+    Raises:
+        InputError: Names the option.
+    """
+    if args.error_model is None:
+        if args.accuracy_frame is not None:
+            raise InputError("--accuracy-frame", args.accuracy_frame, "--error-model beside it")
+        return
+    for name in (*WITHOUT_MODEL, "iterations", "folds", "prior_includes"):
+        given = getattr(args, name)
+        if given != DEFAULTS.get(name):
+            advice = "the error model decides this itself, and predicts every visit from all others"
+            raise InputError(_flag(name), given, "nothing beside --error-model", advice)
 
 
 def prior_of(args: argparse.Namespace, robot: Robot, terminal: Terminal) -> Prior | None:

@@ -135,6 +135,21 @@ class Knowledge:
         readings = Poses(robot, clean, load)
         return replace(readings, deflection=self.model.deflection(readings, self.coefficients))
 
+    def actual(self, q: ArrayLike) -> FloatArray:
+        """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m]."""
+        return self.poses(q).actual
+
+    def reading(self, actual: ArrayLike) -> FloatArray:
+        """(N, joints) what the joints read when they stand at ``actual`` (N, joints): its inverse."""
+        wanted = check_configurations("configurations", actual, self.robot.joint_names)
+        q = np.array(wanted)
+        for _ in range(50):  # a few milliradians that change slowly: each round gains two digits or more
+            error = wanted - self.actual(q)
+            q = q + error
+            if np.abs(error).max(initial=0.0) < 1e-15:
+                break
+        return q
+
     def predict(self, q: ArrayLike, load: FloatArray | None = None) -> Prediction:
         """Mean and covariance of what would be measured at ``q`` (N, joints) [rad | m]."""
         poses = self.poses(q, load)

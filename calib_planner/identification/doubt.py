@@ -46,23 +46,28 @@ FEWEST = 3
 
 def many_are_wrong(solution: Solution, doubt: FloatArray) -> bool:
     """Whether more than a few points are impossible, or gross errors seem to have swollen the scales."""
-    squares, seen, _ = _squares(solution, doubt)
-    far = squares[seen] > float(chdtri(3, IMPOSSIBLE / max(int(seen.sum()), 1)))
+    squares, seen, _ = squares_of_points(solution, doubt)
+    far = squares[seen] > gate_of(int(seen.sum()))
     return bool(far.mean() > FEW or np.median(squares[seen]) < SWOLLEN * float(chdtri(3, 0.5)))
 
 
 def student(solution: Solution, doubt: FloatArray) -> FloatArray:
     """D (N, targets) of every point by the Student t [m²], from the D in force."""
-    squares, seen, own = _squares(solution, doubt)
+    squares, seen, own = squares_of_points(solution, doubt)
     return np.where(seen, own * np.clip((squares - 3.0) / (FREEDOM + 3.0), 0.0, LARGEST), 0.0)
 
 
 def impossible(solution: Solution, doubt: FloatArray) -> FloatArray:
     """D (N, targets) of impossible points [m²], 0 for all others."""
-    squares, seen, own = _squares(solution, doubt)
-    gate = float(chdtri(3, IMPOSSIBLE / max(int(seen.sum()), 1)))
+    squares, seen, own = squares_of_points(solution, doubt)
+    gate = gate_of(int(seen.sum()))
     length = np.sum(left_out(solution).residuals ** 2, axis=2)
     return np.where(seen & (squares > gate), np.minimum(OUT * length, LARGEST * own), 0.0)
+
+
+def gate_of(points: int) -> float:
+    """d² beyond which one of so many points is impossible."""
+    return float(chdtri(3, IMPOSSIBLE / max(points, 1)))
 
 
 def part_of(doubt: FloatArray) -> FloatArray:
@@ -104,7 +109,7 @@ def shifted_run(solution: Solution) -> IntArray | None:
     return inside if len(inside) < len(outside) else outside
 
 
-def _squares(solution: Solution, doubt: FloatArray) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
+def squares_of_points(solution: Solution, doubt: FloatArray) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
     """(N, targets) d²; which points were measured; mean variance of a coordinate in R_i without D [m²]."""
     left = left_out(solution)
     n, targets, _ = left.residuals.shape

@@ -17,8 +17,10 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
+from calib_planner.error_model import Knowledge, to_mapping
 from calib_planner.identification.checks import Disturbance, HiddenErrors, Structure
 from calib_planner.identification.noise_levels import NoiseLevels
+from calib_planner.identification.term_gain import TermGain
 from calib_planner.identification.transmission import Transmission
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot
@@ -201,7 +203,7 @@ class Accuracy:
         parameters: (K,) ρ0 of eq. (14) with the covariance of the fit [m]; infinite where it depends on what the
             data cannot see.
         discrepancy: (K,) what no geometric model holds there [m].
-        complete: (K,) error of the model with joint corrections [m]; ``None`` where none were learnt.
+        complete: (K,) error with joint corrections, or of the error model [m]; ``None`` without either.
         required: Largest error at a pose that the user can live with [m]; NaN: not stated.
     """
 
@@ -316,6 +318,62 @@ def without_noise(square: float, noise: float, count: int) -> float:
 
 
 @dataclass(frozen=True)
+class LeftOutError:
+    """Distances of visits from where all other visits predict them, (M4) [m].
+
+    Attributes:
+        count: Number of points.
+        mean, rms, max: Distances; NaN where no visit can be predicted from the others.
+        predicted_rms: What rms should be by the error model.
+        noise_rms: What the measurement of these points alone adds to rms; NaN where nobody states it.
+    """
+
+    count: int
+    mean: float
+    rms: float
+    max: float
+    predicted_rms: float
+    noise_rms: float = float("nan")
+
+    @property
+    def robot_rms(self) -> float:
+        """As ``Validation.robot_rms`` [m]."""
+        if not np.isfinite(self.noise_rms):
+            return self.rms
+        return without_noise(self.rms**2, self.noise_rms**2, self.count)
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """What an estimate with an error model has beside the parameters.
+
+    Attributes:
+        knowledge: Parameters and all other coefficients with their covariance: it predicts.
+        terms: Every term of the model asked for, with size and gain.
+        left_out: Left-out error beside its prediction.
+        frame: Of the accuracy at the test poses, ``world`` or ``robot``.
+    """
+
+    knowledge: Knowledge
+    terms: tuple[TermGain, ...]
+    left_out: LeftOutError
+    frame: str = "world"
+
+    def positions(self, q: FloatArray) -> FloatArray:
+        """(N, targets, 3) the mean of what would be measured at ``q`` (N, joints) [m]."""
+        return self.knowledge.poses(q).points
+
+    def to_dict(self) -> dict[str, Any]:
+        """The keys of the contract."""
+        left = asdict(self.left_out)
+        return {
+            "accuracy_frame": self.frame,
+            "left_out": {key: left[key] for key in ("count", "mean", "rms", "max", "predicted_rms")},
+            "error_model": {"terms": [asdict(t) for t in self.terms], "model": to_mapping(self.knowledge.model)},
+        }
+
+
+@dataclass(frozen=True)
 class Reason:
     """One finding of a verdict.
 
@@ -372,6 +430,7 @@ class Estimate:
         validation: Statistics on held-out data, if any was given.
         cross_validation: The same by leaving out parts of the data in turn, if it was requested.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.
+        error_model: What else was learnt, and the left-out error; ``None`` without an error model.
     """
 
     calibrated: Robot
@@ -386,11 +445,12 @@ class Estimate:
     validation: Validation | None = None
     cross_validation: Validation | None = None
     verdict: Verdict = UNJUDGED
+    error_model: Learnt | None = None
 
     def positions(self, q: ArrayLike) -> FloatArray:
         """Where the targets are according to the complete model: (N, joints) → (N, targets, 3) [m]."""
         clean = check_configurations("configurations", q, self.calibrated.joint_names)
-        return (self.transmission or self.calibrated).positions(clean)
+        return (self.error_model or self.transmission or self.calibrated).positions(clean)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
@@ -449,5 +509,7 @@ class Estimate:
         for name in ("validation", "cross_validation"):
             if getattr(self, name) is not None:
                 result[name] = asdict(getattr(self, name))
+        if self.error_model is not None:
+            result |= self.error_model.to_dict()
         plain_result: dict[str, Any] = plain(result)
         return plain_result

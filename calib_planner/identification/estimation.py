@@ -322,7 +322,7 @@ def _estimate(
         knowledge=known,
         left_out=left_out(solution),
         doubt=work.state.doubt,
-        terms=term_gains(model, solution.problem, work.state.coefficients, gains),
+        terms=term_gains(model, solution.problem, work.state.coefficients, covariance, gains),
         solution=solution,
         rounds=work.rounds,
         converged=work.converged,

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
 from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
+from calib_planner.error_model import ACCURACIES, ErrorModel, without_rigid_motion
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot, is_nuisance
@@ -23,6 +24,10 @@ UNKNOWN_SIGMA = 1e-4
 """Standard deviation of one coordinate that is assumed until the residuals give one [m]."""
 
 
+WITHOUT_MODEL: Mapping[str, Any] = MappingProxyType(
+    {"loss": "linear", "prior": None, "discrepancy": "auto", "joint_corrections": "auto", "starts": 2}
+)
+"""Settings that must be left alone beside an error model, which decides what they decide."""
 UPDATE: Mapping[str, Any] = MappingProxyType({"starts": 0, "joint_corrections": "off", "order_check": "off"})
 """Settings of a quick update while measurements come in: checks that change no parameter are left to the end."""
 
@@ -51,6 +56,10 @@ class IdentificationProblem:
         order_check: ``auto``: test whether the residuals show a trend with time; ``off``: do not.
         starts: Number of other starts, which must end in the same minimum.
         required_accuracy: Largest acceptable error at a pose [m], for the verdict.
+        error_model: How the robot errs: gravity, joint functions and visits are estimated beside the parameters,
+            and every visit has a left-out error. ``None``: noise, discrepancy and joint corrections as above.
+        accuracy_frame: Of the accuracy at the test poses, (M3): ``world``, or ``robot`` for users who register
+            the robot anew; needs an error model, and four test poses that are not in a plane.
     """
 
     robot: Robot
@@ -66,6 +75,8 @@ class IdentificationProblem:
     order_check: str = "auto"
     starts: int = 2
     required_accuracy: float | None = None
+    error_model: ErrorModel | None = None
+    accuracy_frame: str = "world"
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -101,6 +112,24 @@ class IdentificationProblem:
             self.prior.rows(self.robot.parameter_names, np.zeros(len(self.robot.parameter_names)))
         if not self.data.seen.any():
             raise NotEnoughDataError(0, len(self.robot.parameter_names), "there are no measured points")
+        self._check_error_model()
+
+    def _check_error_model(self) -> None:
+        """Refuse settings that say the same thing twice, and an accuracy that has no meaning."""
+        if self.accuracy_frame not in ACCURACIES:
+            raise UnknownNameError("accuracy_frame", str(self.accuracy_frame), ACCURACIES)
+        if self.error_model is None:
+            if self.accuracy_frame != "world":
+                raise InputError("accuracy_frame", self.accuracy_frame, "'world' without an error model")
+            return
+        for name, usual in WITHOUT_MODEL.items():
+            if getattr(self, name) != usual:
+                got = getattr(self, name).source if name == "prior" else getattr(self, name)
+                advice = "the error model decides this: leave it out, or leave the error model out"
+                raise InputError(name, got, f"{usual!r} beside an error model", advice)
+        if self.accuracy_frame == "robot":
+            points = self.robot.positions(self.test_pose_array)
+            without_rigid_motion(points, np.zeros((points.size, 0)))
 
     @property
     def test_pose_array(self) -> FloatArray:

@@ -15,10 +15,9 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, one_thread
-from calib_planner.errors import NotEnoughDataError
+from calib_planner.identification.by_model import identify_by_model
 from calib_planner.identification.checks import (
     SIGNIFICANT,
     Disturbance,
@@ -38,17 +37,15 @@ from calib_planner.identification.evidence import Evidence, estimate_of
 from calib_planner.identification.least_squares import Fit, gauss_newton
 from calib_planner.identification.noise_levels import improbable
 from calib_planner.identification.problem import IdentificationProblem
-from calib_planner.identification.registration import register
 from calib_planner.identification.robust import (
     gate_of,
     normalised,
-    robust_registration,
     select,
 )
+from calib_planner.identification.start import check_count, start_robot
 from calib_planner.identification.transmission import Transmission, fit_transmission, geometry_covariance
 from calib_planner.identification.weighing import TINY, Weighed, Work, weigh, without_unseen
-from calib_planner.measurements import Measurements
-from calib_planner.robot import BASE_PARAMETERS, Robot, target_parameters
+from calib_planner.robot import Robot
 
 MOST_GATES = 12
 """Rounds of the gate; a selection that still changes then is taken as it is."""
@@ -63,7 +60,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
     """Identify the active parameters.
 
     Args:
-        problem: What is asked.
+        problem: What is asked. With an ``error_model`` the steps are those of ``estimation``.
         start: Values to go on from where a first fit from nominal ones has not come near the minimum, such as the
             estimate before the newest measurement; saves time, the answer is the same.
 
@@ -71,6 +68,8 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         NotEnoughDataError: Fewer equations than parameters, or fewer good points than are needed.
         InputError: The points look like millimetres.
     """
+    if problem.error_model is not None:
+        return identify_by_model(problem)
     began = time.perf_counter()
     check_units(problem.robot, problem.data)
     robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
@@ -110,14 +109,6 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         seconds=time.perf_counter() - began,
     )
     return estimate_of(evidence)
-
-
-def start_robot(robot: Robot, data: Measurements, *, robust: bool = False) -> Robot:
-    """``robot`` with its unknown base and targets, if any, at their closed-form values for these data."""
-    active = set(robot.parameter_names)
-    base, tool = active.issuperset(BASE_PARAMETERS), active.issuperset(target_parameters(len(robot.targets)))
-    how = robust_registration if robust else register
-    return how(robot, data, base=base, tool=tool)
 
 
 # ── points come and go ───────────────────────────────────────────────────────────────────────────────
@@ -166,28 +157,6 @@ def _gate(found: Weighed) -> float:
 def _normalised(work: Work, found: Weighed) -> FloatArray:
     """(N, targets) length of each residual in standard deviations of what it should be."""
     return normalised(found.residuals, found.residual_covariance())
-
-
-def check_count(problem: IdentificationProblem, use: NDArray[np.bool_]) -> None:
-    """More equations than parameters, and not more points rejected than used."""
-    count, equations = len(problem.robot.parameter_names), 3 * int(use.sum())
-    prior = 0 if problem.prior is None else len(problem.prior.names)
-    measured = int(problem.data.seen.sum())
-    if 2 * int(use.sum()) < measured:
-        raise NotEnoughDataError(
-            equations,
-            count,
-            f"only {int(use.sum())} of {measured} points agree with one another: check joint order, units and "
-            "which point belongs to which row before calibrating",
-        )
-    if equations + prior < count:
-        each = 3 * problem.data.p.shape[1]
-        raise NotEnoughDataError(
-            equations,
-            count,
-            f"{equations} equations for {count} parameters: measure at least {-(-(count - prior) // each)} "
-            "configurations, or ask for fewer parameters",
-        )
 
 
 # ── is it the only minimum? ──────────────────────────────────────────────────────────────────────────

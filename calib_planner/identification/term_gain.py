@@ -2,13 +2,14 @@
 
 A term with columns moves the measured points by B û; of the joint functions a component has the share of û that
 its prior variance has of the whole. Visits and points scatter the measured points by the trace of their part of
-R_i. The size is the root mean square over the measured points. The gain is the left-out log score with the term
+R_i. The size is the root mean square over the measured points; what the uncertainty of û adds there is the
+standard deviation of that. The gain is the left-out log score with the term
 less that without it: a term that predicts gains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,16 +28,23 @@ class TermGain:
         size: Root mean square of what it moves a measured point by [m]; 0 if the term went.
         gain: Left-out log score with it less that without; NaN where it is not asked.
         kept: Whether it is in the model.
+        std: Root mean square of the standard deviation of what it moves a measured point by [m]; NaN for visits
+            and points, and if the term went.
     """
 
     name: str
     size: float
     gain: float
     kept: bool
+    std: float = float("nan")
 
 
 def term_gains(
-    asked: ErrorModel, problem: LinearProblem, coefficients: FloatArray, gains: Mapping[str, float]
+    asked: ErrorModel,
+    problem: LinearProblem,
+    coefficients: FloatArray,
+    covariance: FloatArray,
+    gains: Mapping[str, float],
 ) -> tuple[TermGain, ...]:
     """Every term of the model ``asked`` for.
 
@@ -44,38 +52,60 @@ def term_gains(
         asked: The model before terms went.
         problem: The last linear problem, with the model that is left.
         coefficients: (coefficients,) β where it ended.
+        covariance: (coefficients, coefficients) of β.
         gains: Term → gain, of terms that had to better the left-out score.
     """
-    squares = _squares(problem, coefficients)
+    squares, variances = _squares(problem, coefficients), _variances(problem, covariance)
     points = max(float(problem.seen.sum()) / 3.0, 1.0)
     names = [
         n for term in asked.terms for n in (term.components if isinstance(term, JointFunctions) else (term.name,))
     ]
     nothing = float("nan")
     return tuple(
-        TermGain(n, float(np.sqrt(squares.get(n, 0.0) / points)), gains.get(n, nothing), n in squares)
+        TermGain(
+            name=n,
+            size=float(np.sqrt(squares.get(n, 0.0) / points)),
+            gain=gains.get(n, nothing),
+            kept=n in squares,
+            std=float(np.sqrt(max(variances[n], 0.0) / points)) if n in variances else nothing,
+        )
         for n in names
     )
 
 
 def _squares(problem: LinearProblem, coefficients: FloatArray) -> dict[str, float]:
     """Term of the model that is left → sum of squares of what it moves the measured points by [m²]."""
-    model, robot = problem.model, problem.robot
-    result = {}
-    for term in model.systematic:
-        place = model.slices(robot)[term.name]
-        own, columns = coefficients[place], problem.columns[:, :, place]
-        if not isinstance(term, JointFunctions):
-            result[term.name] = float(np.sum((columns @ own) ** 2))
-            continue
-        total = term.variances(robot, model.values)
-        for component in term.components:
-            alone = JointFunctions((component,), term.harmonics).variances(robot, model.values)
-            share = np.divide(alone, total, out=np.zeros(len(total)), where=total > 0.0)
-            result[component] = float(np.sum((columns @ (share * own)) ** 2))
+    model = problem.model
+    result = {
+        name: float(np.sum((problem.columns[:, :, place] @ (share * coefficients[place])) ** 2))
+        for name, place, share in _columns(problem)
+    }
     for scattering in (model.visits, model.points):
         if scattering is not None:
             parts = ("instrument", *scattering.scales) if scattering is model.points else scattering.scales
             traces = [np.trace(problem.parts[n], axis1=1, axis2=2).sum() for n in set(parts) & set(problem.parts)]
             result[scattering.name] = float(np.sum(traces))
     return result
+
+
+def _variances(problem: LinearProblem, covariance: FloatArray) -> dict[str, float]:
+    """Term with columns → sum of the variances of what it moves the measured points by [m²]."""
+    result = {}
+    for name, place, share in _columns(problem):
+        columns = (problem.columns[:, :, place] * share).reshape(problem.y.size, -1)
+        result[name] = float(np.sum((columns.T @ columns) * covariance[place, place]))
+    return result
+
+
+def _columns(problem: LinearProblem) -> Iterator[tuple[str, slice, FloatArray]]:
+    """Term or component with columns; where its coefficients are; (coefficients,) its share of them."""
+    model, robot = problem.model, problem.robot
+    for term in model.systematic:
+        place = model.slices(robot)[term.name]
+        if not isinstance(term, JointFunctions):
+            yield term.name, place, np.ones(term.size(robot))
+            continue
+        total = term.variances(robot, model.values)
+        for component in term.components:
+            alone = JointFunctions((component,), term.harmonics).variances(robot, model.values)
+            yield component, place, np.divide(alone, total, out=np.zeros(len(total)), where=total > 0.0)

@@ -13,6 +13,9 @@ those rows (see ``fit_discrepancy``) is subtracted first. The test rows are not 
 pseudoinverse that turns errors e₀ at those rows into an error of the offset, and J_t = ∂p/∂t, the error at a
 test row is (J − J_t G J₀) ΔΠ + e − J_t G e₀.
 
+With an error model the mean and the covariance of ``Knowledge.predict`` stand for all of this, and a re-seated
+target is a new one that the rows of the seat tell (``Knowledge.with_new_targets``, ``updated``).
+
 *Cross-validation* needs no further data: the configurations are dealt into folds, and each is predicted by
 the fit to the others.
 """
@@ -36,7 +39,8 @@ from calib_planner.identification.noise_levels import Discrepancy, fit_discrepan
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
 from calib_planner.identification.robust import normalised
-from calib_planner.identification.solver import identify, start_robot
+from calib_planner.identification.solver import identify
+from calib_planner.identification.start import start_robot
 from calib_planner.identification.transmission import Transmission
 from calib_planner.identification.verdict import judged
 from calib_planner.measurements import Measurements
@@ -64,9 +68,10 @@ def validate(
     """
     if target_from < 0:
         raise InputError("validate_target_from", target_from, "a whole number >= 0")
-    models = _models(estimate)
+    models, learnt = _models(estimate), estimate.error_model
     before = _Geometry(_before(problem), estimate)
-    discrepancy = _discrepancy(problem, estimate) if target_from and estimate.transmission is None else None
+    guess = target_from and estimate.transmission is None and learnt is None
+    discrepancy = _discrepancy(problem, estimate) if guess else None
     predictions: list[list[_Prediction]] = []
     for data in (d.in_order_of(problem.robot.joint_names) for d in held_out):
         if len(data) <= target_from:
@@ -79,7 +84,8 @@ def validate(
         seat, rest = data.select(np.arange(target_from)), data.select(np.arange(target_from, len(data)))
         expected = np.zeros((len(seat), 3)) if discrepancy is None else discrepancy.predict(seat.q)
         cleaned = Measurements(seat.joint_names, seat.q, seat.p - expected[:, None], seat.std)
-        predictions.append([*(_predict(m, cleaned, rest) for m in models), _predict(before, seat, rest)])
+        best = _predict(models[0], cleaned, rest) if learnt is None else _predict_known(estimate, seat, rest)
+        predictions.append([best, _predict(models[1], cleaned, rest), _predict(before, seat, rest)])
     return judged(replace(estimate, validation=_statistics(predictions)))
 
 
@@ -93,8 +99,11 @@ def cross_validate(problem: IdentificationProblem, estimate: Estimate, folds: in
 
     Raises:
         NotEnoughDataError: What a fold leaves is too little.
-        InputError: More folds than configurations.
+        InputError: More folds than configurations, or an estimate by an error model.
     """
+    if estimate.error_model is not None:
+        advice = "its left-out error is what all other visits predict of each"
+        raise InputError("folds", folds, "none beside an error model", advice)
     labels = configuration_labels(problem.data.q)
     count = int(labels.max()) + 1
     check_count("folds", folds, low=2, high=count)
@@ -231,6 +240,26 @@ def _predict(model: _Model, seat: Measurements, rest: Measurements) -> _Predicti
     points = model.robot.positions(model.actual(rest.q))
     covariance = columns @ model.covariance() @ np.swapaxes(columns, 2, 3) + error
     return _Prediction((rest.p - points)[rest.seen], covariance[rest.seen], measured[rest.seen])
+
+
+def _predict_known(estimate: Estimate, seat: Measurements, rest: Measurements) -> _Prediction:
+    """The mean of the error model against ``rest``; targets that were put on anew are told by ``seat``."""
+    assert estimate.error_model is not None
+    known, targets = estimate.error_model.knowledge, rest.p.shape[1]
+    if len(seat):
+        offsets = np.zeros((targets, 3))
+        there = estimate.calibrated.target_offsets[:targets]
+        offsets[: len(there)] = there
+        known = known.with_new_targets(offsets)
+        known = known.updated(seat.q, np.where(seat.seen[:, :, None], seat.p, 0.0), seat.seen)
+    elif len(known.robot.targets) < targets:
+        raise InputError("validation data", f"{targets} targets", f"at most {len(known.robot.targets)} targets")
+    told = known.predict(rest.q)
+    measured = np.diagonal(told.noise, axis1=2, axis2=3)[:, :targets]
+    if estimate.noise.source == "residuals":
+        measured = np.full_like(measured, np.nan)
+    residuals = (rest.p - told.mean[:, :targets])[rest.seen]
+    return _Prediction(residuals, told.total[:, :targets][rest.seen], measured[rest.seen])
 
 
 def _with_seat(

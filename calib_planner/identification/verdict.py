@@ -28,6 +28,8 @@ APART = 1.5
 """Achieved over predicted error beyond which a prediction is not kept."""
 UNLIKELY_SHIFT = 4.0
 """A parameter that may be wrong by more than this many standard deviations is reported."""
+SYSTEMATIC = ("gravity", "smooth", "short")
+"""Terms of an error model that move the robot the same each time, beside its geometry."""
 IMPROBABLE_FIT, TOO_GOOD_FIT = 1e-3, 1.0 - 1e-6
 """χ² probabilities of the residuals below and above which the stated noise is doubted."""
 
@@ -213,6 +215,32 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
         "{points}: {achieved} achieved, {noise}, where {required} are required",
         {"PASS": "", "FAIL": "free more parameters, measure more, or calibrate closer to the task"},
     ),
+    (
+        "unproven",
+        "no visit can be predicted from the others: there is no left-out error",
+        {"WARN": "measure more configurations than the parameters need"},
+    ),
+    (
+        "left_out",
+        "visits left out in turn: {achieved} achieved where {predicted} were predicted",
+        {"PASS": ""}
+        | _each("the visits contradict the error model: look at the rejected points first", "WARN", "FAIL"),
+    ),
+    (
+        "no_gain_left_out",
+        "visits left out in turn are no better than before: {after}, before {before}",
+        {"FAIL": "do not apply it: free fewer parameters or measure more"},
+    ),
+    (
+        "required_accuracy: left out",
+        "visits left out in turn: {achieved} achieved, {noise}, where {required} are required",
+        {"PASS": "", "FAIL": "measure more, or calibrate closer to the task"},
+    ),
+    (
+        "error_model",
+        "the robot errs beyond its geometry ({terms} at the measured points): this is part of every prediction",
+        {"PASS": "a URDF holds placement only and lacks all of this: use calib-planner compensate"},
+    ),
     ("not_validated", "nothing was held out", {"PASS": "--validate FILE, or --folds 5 on these data"}),
     (
         "no_gain_held_out",
@@ -230,7 +258,7 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
         {"WARN": "compare the two sets: temperature, the tracker's place, the target's seat, load"},
     ),
 )
-LIMITS = {"rejected": (0.05, 0.20), "predicted_and_achieved": (APART, 3.0)}
+LIMITS = {"rejected": (0.05, 0.20), "predicted_and_achieved": (APART, 3.0), "left_out": (APART, 3.0)}
 """Reason → share of the points, and achieved over predicted error, beyond which its level is WARN and FAIL."""
 RULES = {key: Rule(key.partition(":")[0], text, advice) for key, text, advice in _TABLE}
 """Everything that a verdict on an estimate can say, in the order of the checks. A key is the code, with a word
@@ -255,6 +283,7 @@ def judge(estimate: Estimate) -> Verdict:
         _data,
         _rejections,
         _scatter,
+        _left_out,
         _order,
         _structure,
         _local,
@@ -300,6 +329,8 @@ def _rejections(e: Estimate) -> Iterator[Reason]:
 
 
 def _scatter(e: Estimate) -> Iterator[Reason]:
+    if e.error_model is not None:
+        return  # its scales are those of the residuals
     noise, measurement = e.noise, length(e.noise.measurement)
     if noise.scaled > 1.0:
         yield RULES["repeatability"].reason(factor=f"{noise.scaled:.2g}", source=noise.source)
@@ -311,6 +342,30 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
         yield RULES["poor_fit"].reason(noise=measurement, probability=f"< {IMPROBABLE_FIT:g}")
     elif probability > TOO_GOOD_FIT:
         yield RULES["noise_overstated"].reason(scatter=length(e.residuals.sigma), noise=measurement)
+
+
+def _left_out(e: Estimate) -> Iterator[Reason]:
+    if e.error_model is None:
+        return
+    left, before, required = e.error_model.left_out, e.residuals.before.mean, e.accuracy.required
+    terms = [f"{t.name} {length(t.size)}" for t in e.error_model.terms if t.kept and t.name in SYSTEMATIC]
+    if terms:
+        yield RULES["error_model"].reason(terms=", ".join(terms))
+    if not left.count:
+        yield RULES["unproven"].reason()
+        return
+    if left.mean >= before:
+        yield RULES["no_gain_left_out"].reason(after=length(left.mean), before=length(before))
+    achieved, ratio = length(left.rms), left.rms / left.predicted_rms
+    yield _graded("left_out", ratio, achieved=achieved, predicted=length(left.predicted_rms))
+    if np.isfinite(required):
+        of_it = f"of it {length(left.noise_rms)} the measurement's"
+        yield RULES["required_accuracy: left out"].reason(
+            "PASS" if left.robot_rms <= required else "FAIL",
+            achieved=achieved,
+            noise=of_it if left.noise_rms > 0 else "the measurement's part included",
+            required=length(required),
+        )
 
 
 def _order(e: Estimate) -> Iterator[Reason]:
@@ -403,12 +458,12 @@ def _accuracy(e: Estimate) -> Iterator[Reason]:
         if level == "FAIL" and e.accuracy.discrepancy.max() > required:
             rule = "required_accuracy: discrepancy"
         yield RULES[rule].reason(level, worst=length(worst), required=length(required))
-    elif not len(predicted) and e.validation is None and e.cross_validation is None:
+    elif not len(predicted) and e.validation is None and e.cross_validation is None and e.error_model is None:
         yield RULES["required_accuracy: nowhere"].reason(required=length(required))
 
 
 def _held_out(e: Estimate) -> Iterator[Reason]:
-    if e.validation is None and e.cross_validation is None:
+    if e.validation is None and e.cross_validation is None and e.error_model is None:
         yield RULES["not_validated"].reason()
     if e.validation is not None:
         yield from _validation(e.validation, "held-out points", e.accuracy.required)

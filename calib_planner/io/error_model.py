@@ -21,7 +21,7 @@ from calib_planner.error_model import (
     to_mapping,
 )
 from calib_planner.io.robots import config_folder
-from calib_planner.io.yaml import read_document, read_yaml, write_document
+from calib_planner.io.yaml import Node, read_document, read_yaml, write_document
 from calib_planner.tracker import Noise
 
 KIND = "error_model"
@@ -40,7 +40,8 @@ def read_error_model(source: str | Path, noise: Noise | None = None) -> ErrorMod
     """A model by name or from a file.
 
     Args:
-        source: ``paper``, ``typical``, or the path of a file that ``write_error_model`` wrote.
+        source: ``paper``, ``typical``, or the path of a file: an error model alone (``write_error_model``), or an
+            estimate that holds one.
         noise: The instrument, for the models with a name; a file holds its own.
 
     Raises:
@@ -50,8 +51,19 @@ def read_error_model(source: str | Path, noise: Noise | None = None) -> ErrorMod
         return ErrorModel.paper(noise)
     if source == "typical":
         return typical(noise)
-    part = read_document(source, KIND)["error_model"]
+    part = _saved(source)
     return part.build(lambda: from_mapping(part.mapping().value))
+
+
+def _saved(path: str | Path) -> Node:
+    """The mapping of a model in a file of its own or in an estimate."""
+    if read_yaml(path, "a YAML file with an error model").value.get("format") != "calib_planner/estimate":
+        return read_document(path, KIND)["error_model"]
+    part = read_document(path, "estimate").get("error_model")
+    if part.value is None:
+        advice = "give an estimate that identify --error-model wrote"
+        raise part.error("nothing", "the error model of the estimate", advice)
+    return part["model"]
 
 
 def typical(

@@ -10,12 +10,22 @@ file holds both as they were identified:
     base: {x, y, z, yaw, pitch, roll, rx, ry, rz}    # the robot in the tracker's frame [m, rad]
     targets: [[x, y, z], …]                          # in the tip's frame [m]
 
+An estimate by an error model holds what predicts again, in ``error_model``: beside the terms and the model (see
+``error_model.to_mapping``) the start of base and targets, from which their parameters are deviations, and
+
+    names: [...]               # of the coefficients β, parameters first
+    coefficients: [...]        # their mean
+    covariance: text           # lower triangle, row by row, as base64 of little-endian doubles
+    hidden: [[...], ...]       # directions of β that nothing shows
+
 A chain begins with the base's pose, T(x, y, z) Rz(yaw) Ry(pitch) Rx(roll) Rx(rx) Ry(ry) Rz(rz): roll, pitch and
 yaw are the closed form's orientation, and rx, ry and rz what was identified beyond it.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import re
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields, replace
@@ -24,7 +34,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, plain
+from calib_planner.arrays import FloatArray, frozen, plain
+from calib_planner.error_model import ErrorModel, Knowledge, from_mapping
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import ChiSquare, Estimate, JointCorrections, NoiseLevels, Reason, Verdict
 from calib_planner.io.yaml import Node, read_document, write_document
@@ -64,12 +75,29 @@ def document_of(estimate: Estimate) -> dict[str, Any]:
     """What ``write_estimate`` writes, without its format line, as plain values."""
     content = estimate.to_dict()
     unlimited = {key: getattr(estimate.accuracy, name) for key, name in UNLIMITED.items() if key in content}
+    if estimate.error_model is not None:
+        content["error_model"] |= plain(_knowledge_mapping(estimate.error_model.knowledge))
     return content | plain(unlimited, keep_infinite=True) | placement(estimate)
 
 
 def placement(estimate: Estimate) -> dict[str, Any]:
     """Where the robot stands in the tracker's frame and the targets in the tip's, as plain values."""
-    robot = estimate.calibrated
+    return _places_of(estimate.calibrated)
+
+
+def _knowledge_mapping(known: Knowledge) -> dict[str, Any]:
+    """What predicts again, but for the model itself."""
+    lower = known.covariance[np.tril_indices(len(known.coefficients))]
+    return {
+        "names": known.model.names(known.robot),
+        "coefficients": known.coefficients,
+        "covariance": base64.b64encode(lower.astype("<f8").tobytes()).decode(),
+        "hidden": known.hidden.T,
+        "start": _places_of(known.robot),
+    }
+
+
+def _places_of(robot: Robot) -> dict[str, Any]:
     base = {name: e.value for name, e in zip(BASE, robot.elements[: len(BASE)], strict=True)}
     return {"base": base, "targets": robot.target_offsets.tolist()}
 
@@ -117,6 +145,7 @@ def parse_estimate(top: Node) -> SavedEstimate:
             (None,), finite=False
         ),
         joint_corrections=_corrections(top, names),
+        learnt=_learnt(top.get("error_model")),
         document=dict(top.value),
     )
 
@@ -164,6 +193,38 @@ def _corrections(top: Node, names: tuple[str, ...]) -> SavedCorrections | None:
     return SavedCorrections(JointCorrections(joints, **series), names, _in_order(node["parameters"], names))
 
 
+def _learnt(node: Node) -> SavedKnowledge | None:
+    if node.value is None:
+        return None
+    node.mapping(None, ("model", "names", "coefficients", "covariance", "hidden", "start"))
+    start = node["start"].mapping(("base", "targets"), ("base", "targets"))
+    names = node["names"].of_kind("tuple[str, ...]")
+    count, model = len(names), node["model"].mapping()
+    hidden = node["hidden"].array((None, count)) if node["hidden"].value else np.empty((0, count))
+    return SavedKnowledge(
+        model=model.build(lambda: from_mapping(model.value)),
+        names=names,
+        coefficients=node["coefficients"].array((count,)),
+        covariance=_symmetric(node["covariance"], count),
+        hidden=frozen(hidden.T),
+        base=_in_order(start["base"], BASE),
+        targets=start["targets"].array((None, 3)),
+    )
+
+
+def _symmetric(node: Node, count: int) -> FloatArray:
+    """(count, count) from the text of its lower triangle."""
+    try:
+        lower = np.frombuffer(base64.b64decode(node.text(), validate=True), "<f8")
+    except (binascii.Error, ValueError):
+        raise node.error("text", "base64 of doubles, as it was written") from None
+    if lower.size != count * (count + 1) // 2 or not np.isfinite(lower).all():
+        raise node.error(f"{lower.size} numbers", f"{count * (count + 1) // 2} finite ones")
+    result = np.zeros((count, count))
+    result[np.tril_indices(count)] = lower
+    return frozen(result + np.tril(result, -1).T)
+
+
 def _verdict(node: Node) -> Verdict | None:
     if node.value is None:
         return None
@@ -190,6 +251,29 @@ class SavedCorrections:
 
 
 @dataclass(frozen=True, eq=False)
+class SavedKnowledge:
+    """What an error model learnt; see ``Knowledge``.
+
+    Attributes:
+        model: The terms with their estimated scales.
+        names: Of the coefficients β.
+        coefficients: (coefficients,) their mean.
+        covariance: (coefficients, coefficients).
+        hidden: (coefficients, directions).
+        base: (9,) the base's pose at the start, see ``BASE`` [m, rad].
+        targets: (targets, 3) at the start [m].
+    """
+
+    model: ErrorModel
+    names: tuple[str, ...]
+    coefficients: FloatArray
+    covariance: FloatArray
+    hidden: FloatArray
+    base: FloatArray
+    targets: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class SavedEstimate:
     """What an estimate file says.
 
@@ -212,6 +296,7 @@ class SavedEstimate:
         verdict: Whether the calibration is good, or ``None``.
         predicted_accuracy_per_test_pose: (K,) [m]; infinite where it rests on what the data cannot see.
         joint_corrections: Errors of the joints' transmissions with their geometry, or ``None``.
+        learnt: What an error model learnt, or ``None``.
         document: Everything that the file holds, as plain values.
     """
 
@@ -233,6 +318,7 @@ class SavedEstimate:
     verdict: Verdict | None
     predicted_accuracy_per_test_pose: FloatArray
     joint_corrections: SavedCorrections | None
+    learnt: SavedKnowledge | None
     document: dict[str, Any]
 
     def calibrated(self, robot: Robot) -> Robot:
@@ -245,10 +331,24 @@ class SavedEstimate:
         moved = self.corrected(robot)
         if self.base is None or self.targets is None:
             raise InputError("estimate", "no base or targets", "a file that holds them", "identify again")
-        count = len(BASE)
-        head = (replace(e, value=float(v)) for e, v in zip(moved.elements[:count], self.base, strict=True))
-        placed = replace(moved, elements=(*head, *moved.elements[count:])).with_targets(self.targets)
-        return replace(placed, parameter_names=self.parameters)
+        return replace(_put(moved, self.base, self.targets), parameter_names=self.parameters)
+
+    def knowledge(self, robot: Robot) -> Knowledge:
+        """What predicts as the estimate did, for the nominal ``robot``.
+
+        Raises:
+            InputError: The estimate is of another robot or version of it, or was made without an error model.
+            UnknownNameError: The robot has no parameter of that name.
+        """
+        self.check_robot(robot)
+        saved = self.learnt
+        if saved is None:
+            raise InputError("estimate", "no error model", "an estimate by an error model", "identify again")
+        placed = replace(_put(robot, saved.base, saved.targets), parameter_names=self.parameters)
+        if saved.model.names(placed) != saved.names:
+            advice = "give the robot that the estimate was made with"
+            raise InputError("estimate.error_model", "coefficients of another robot", "the robot's", advice)
+        return Knowledge(placed, saved.model, saved.coefficients, saved.covariance, saved.hidden)
 
     def complete(self, robot: Robot) -> Robot:
         """The geometry that belongs with ``joint_corrections``, right at their ``actual``; base and targets too.
@@ -305,6 +405,13 @@ class SavedEstimate:
     def chain_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are neither the base's nor the targets'."""
         return tuple(n for n in self.parameters if not is_nuisance(n))
+
+
+def _put(robot: Robot, base: FloatArray, targets: FloatArray) -> Robot:
+    """The robot with its base's pose (9,) and targets (targets, 3) at these values."""
+    count = len(BASE)
+    head = (replace(e, value=float(v)) for e, v in zip(robot.elements[:count], base, strict=True))
+    return replace(robot, elements=(*head, *robot.elements[count:])).with_targets(targets)
 
 
 def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:
