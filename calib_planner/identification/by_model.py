@@ -30,13 +30,13 @@ from calib_planner.identification.estimate import (
     residual_statistics,
 )
 from calib_planner.identification.estimation import ModelEstimate, fit_error_model
-from calib_planner.identification.evidence import distances, fit_placement
+from calib_planner.identification.evidence import blind_poses, distances, fit_placement
 from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.start import check_count, start_robot
 from calib_planner.identification.verdict import judged
 from calib_planner.measurements import RejectedPoint
-from calib_planner.robot import Identifiability, analyse
+from calib_planner.robot import Identifiability, Robot, analyse
 from calib_planner.units import length
 
 BoolArray = NDArray[np.bool_]
@@ -54,12 +54,16 @@ def identify_by_model(problem: IdentificationProblem) -> Estimate:
     check_units(problem.robot, problem.data)
     check_count(problem, problem.data.seen)
     model = with_stated_noise(problem)
-    found = fit_error_model(problem.robot, problem.data, model)
-    hidden = _hidden(found)
-    if hidden.fixed:
-        found = _without(problem, model, found, hidden)
+    robot = start_robot(problem.robot, problem.data, robust=not model.is_papers)
+    # A fit may run so far along what it cannot see that it seems to see it: this is asked first at the start.
+    hidden = _hidden(model, robot, robot.jacobian(problem.data.q)[np.repeat(problem.data.seen, 3, axis=1)])
+    found = _fit(problem, model, robot, hidden)
+    if found.knowledge.hidden.shape[1]:
+        there = found.knowledge.poses(problem.data.q)
+        hidden = _hidden(model, robot, there.jacobian[np.repeat(problem.data.seen, 3, axis=1)])
+        found = _fit(problem, model, robot, hidden)
     check_count(problem, problem.data.seen & (found.doubt == 0.0))
-    return _estimate(problem, found, hidden, began)
+    return _estimate(problem, found, hidden, robot, began)
 
 
 def with_stated_noise(problem: IdentificationProblem) -> ErrorModel:
@@ -78,47 +82,44 @@ def with_stated_noise(problem: IdentificationProblem) -> ErrorModel:
 # ── what cannot be seen ──────────────────────────────────────────────────────────────────────────────
 
 
-def _hidden(found: ModelEstimate) -> Identifiability:
-    """Combinations of the parameters that nothing tells."""
-    if not found.knowledge.hidden.shape[1]:
+def _hidden(model: ErrorModel, robot: Robot, rows: FloatArray) -> Identifiability:
+    """Combinations of the parameters that nothing tells, from the Jacobian's ``rows`` (equations, P)."""
+    names = robot.parameter_names
+    flat = np.flatnonzero(np.isinf(model.variances(robot)[: len(names)]))
+    if not flat.size:
         return NOTHING_HIDDEN
-    problem, names = found.solution.problem, found.knowledge.robot.parameter_names
-    flat = problem.flat
-    rows = problem.columns[:, :, flat].reshape(problem.y.size, -1)
-    seen = analyse(rows, [names[i] for i in flat])
+    seen = analyse(rows[:, flat], [names[i] for i in flat])
     directions = np.zeros((len(seen.fixed), len(names)))
     directions[:, flat] = seen.directions
-    fixed = tuple(int(flat[i]) for i in seen.fixed)
-    return replace(seen, fixed=fixed, directions=directions)
+    return replace(seen, fixed=tuple(int(flat[i]) for i in seen.fixed), directions=directions)
 
 
-def _without(
-    problem: IdentificationProblem, model: ErrorModel, found: ModelEstimate, hidden: Identifiability
+def _fit(
+    problem: IdentificationProblem, model: ErrorModel, robot: Robot, hidden: Identifiability
 ) -> ModelEstimate:
     """The fit without one parameter of each hidden combination; all of them are in its knowledge again."""
-    names = problem.robot.parameter_names
-    robot = start_robot(problem.robot, problem.data, robust=not model.is_papers)
+    names = robot.parameter_names
     kept = tuple(n for i, n in enumerate(names) if i not in hidden.fixed)
-    if not kept:
-        return found
-    fewer = fit_error_model(replace(robot, parameter_names=kept), problem.data, model)
-    known = fewer.knowledge
+    if not hidden.fixed or not kept:
+        return fit_error_model(robot, problem.data, model)
+    found = fit_error_model(replace(robot, parameter_names=kept), problem.data, model)
+    known = found.knowledge
     own = known.model.names(replace(known.robot, parameter_names=names))
     place = [own.index(n) for n in known.model.names(known.robot)]
     coefficients, covariance = np.zeros(len(own)), np.zeros((len(own), len(own)))
     coefficients[place] = known.coefficients
     covariance[np.ix_(place, place)] = known.covariance
-    unseen = np.zeros((len(own), len(hidden.fixed)))
-    unseen[: len(names)] = hidden.directions.T
-    whole = Knowledge(replace(known.robot, parameter_names=names), known.model, coefficients, covariance, unseen)
-    return replace(fewer, knowledge=whole)
+    unseen = np.zeros((len(own), known.hidden.shape[1]))
+    unseen[place] = known.hidden
+    placed = replace(known.robot, parameter_names=names)
+    return replace(found, knowledge=Knowledge(placed, known.model, coefficients, covariance, unseen))
 
 
 # ── the parts of the estimate ────────────────────────────────────────────────────────────────────────
 
 
 def _estimate(
-    problem: IdentificationProblem, found: ModelEstimate, hidden: Identifiability, began: float
+    problem: IdentificationProblem, found: ModelEstimate, hidden: Identifiability, start: Robot, began: float
 ) -> Estimate:
     """The answer, with its verdict."""
     known, data, model = found.knowledge, problem.data, found.knowledge.model
@@ -131,9 +132,7 @@ def _estimate(
     predicted = known.poses(data.q).points
     residuals = data.p - predicted
     normalised = np.where(seen, np.sqrt(squares_of_points(found.solution, found.doubt)[0]), np.nan)
-    before = data.p - fit_placement(start_robot(problem.robot, data, robust=not model.is_papers), data).positions(
-        data.q
-    )
+    before = data.p - fit_placement(start, data).positions(data.q)
     levels = _levels(problem, found, use)
     linear, rank = found.solution.problem, len(names) - len(hidden.fixed)
     flat, spare = linear.basis.shape[1], 3 * int(use.sum()) - rank
@@ -177,7 +176,7 @@ def _estimate(
             chi_square=ChiSquare(chi, int(linear.seen.sum()) - flat),
         ),
         noise=levels,
-        accuracy=_accuracy(problem, known),
+        accuracy=_accuracy(problem, known, blind_poses(start, data, hidden.directions, problem.test_pose_array)),
         diagnostics=Diagnostics((), (), rejected_since(seen, use), None, 0, 0, time.perf_counter() - began),
         error_model=Learnt(known, found.terms, _left_out(found, levels.source), problem.accuracy_frame),
     )
@@ -212,13 +211,16 @@ def _levels(problem: IdentificationProblem, found: ModelEstimate, use: BoolArray
     return NoiseLevels(sigma, "residuals" if points.noise is None else "instrument")
 
 
-def _accuracy(problem: IdentificationProblem, known: Knowledge) -> Accuracy:
-    """(M3) at the test poses, what the parameters have of it, and what placement alone would lack."""
+def _accuracy(problem: IdentificationProblem, known: Knowledge, blind: BoolArray) -> Accuracy:
+    """(M3) at the test poses, what the parameters have of it, and what placement alone would lack.
+
+    Infinite at the poses (K,) that are ``blind``.
+    """
     poses = problem.test_pose_array
     required = float("nan") if problem.required_accuracy is None else problem.required_accuracy
     if not len(poses):
         return Accuracy(poses, np.empty(0), np.empty(0), None, required)
-    complete = known.accuracy(poses, problem.accuracy_frame).per_pose
+    complete = np.where(blind, np.inf, known.accuracy(poses, problem.accuracy_frame).per_pose)
     told, names = known.predict(poses), known.robot.parameter_names
     placed = known.robot.with_deviations(dict(zip(names, known.coefficients[: len(names)], strict=True)))
     missed = np.sum((told.mean - placed.positions(poses)) ** 2, axis=2)

@@ -312,6 +312,7 @@ def _estimate(
             solution = whole.reconsider(solution, 2, 0)
         work = whole
     hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
+    covariance = 0.5 * (covariance + covariance.T)  # rounding
     told = work.state.model
     if data.std is not None and told.points.noise is None:
         # What was said of these points is what is expected of others.

@@ -204,8 +204,22 @@ def _blind(evidence: Evidence, poses: FloatArray) -> NDArray[np.bool_]:
         return np.zeros(len(poses), bool)
     directions = evidence.identifiability.directions[unseen].T
     seen = np.linalg.norm(evidence.jacobian @ directions, axis=2).max(axis=(0, 1))
-    there = np.linalg.norm(evidence.robot.jacobian(poses, evidence.at) @ directions, axis=1)
-    return np.asarray((there > 10.0 * seen + BLIND).any(axis=1))
+    return _felt(seen, evidence.robot.jacobian(poses, evidence.at) @ directions)
+
+
+def blind_poses(robot: Robot, data: Measurements, directions: FloatArray, poses: FloatArray) -> NDArray[np.bool_]:
+    """(K,) the same for ``directions`` (fixed, P) that were found where ``robot`` is."""
+    if not len(directions):
+        return np.zeros(len(poses), bool)
+    moved = robot.jacobian(data.q) @ directions.T
+    moved = np.where(np.repeat(data.seen, 3, axis=1)[:, :, None], moved, 0.0)
+    seen = np.linalg.norm(moved.reshape(*data.p.shape, -1), axis=2).max(axis=(0, 1))
+    return _felt(seen, robot.jacobian(poses) @ directions.T)
+
+
+def _felt(seen: FloatArray, moved: FloatArray) -> NDArray[np.bool_]:
+    """(K,) whether ``moved`` (K, 3·targets, fixed) at a pose is far more than ``seen`` (fixed,) at any point."""
+    return np.asarray((np.linalg.norm(moved, axis=1) > 10.0 * seen + BLIND).any(axis=1))
 
 
 def _nearly_dependent(fit: Fit, names: tuple[str, ...]) -> tuple[str, ...]:

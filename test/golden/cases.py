@@ -285,6 +285,13 @@ def _identifications() -> list[Case]:
         ),
         Case("identify_linear_spoilt", "identify --robot kuka_kr270 --data kuka_spoilt_mm.csv --millimetres"),
         Case("identify_urdf", f"{arm} --prior typical {files}", ("e.yaml", "r.html", "c.urdf", "k.yaml")),
+        Case("identify_error_model", f"{arm} --error-model typical --validate arm_held_out.csv"),
+        Case(
+            "identify_error_model_paper",
+            f"{kuka} --error-model paper --accuracy-frame robot --test-pose '0 -1 1.5 0 0.8 0' "
+            "--test-pose '0.3 -1 1 0 0.5 0' --test-pose '-0.4 -0.8 1.2 0.3 0.6 0'"
+            " --test-pose '0.1 -1.3 0.9 1 0.7 0'",
+        ),
         Case("identify_rank", f"{arm} --sigma 3e-5 --starts 0"),
         Case(
             "identify_with_tool",

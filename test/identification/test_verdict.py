@@ -11,7 +11,9 @@ from cells import POSE, ROUND, SIGMA, WrongRobot, bare, placed_cell, plain_cell,
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Robot, identify, validate
+from calib_planner.error_model import ErrorModel
 from calib_planner.identification import LEVELS, RULES, cross_validate, judged
+from calib_planner.io import typical
 from calib_planner.measurements import RejectedPoint
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -136,6 +138,17 @@ def round_one_posture(**options):
     return solved(bare(cell.measure(ROUND, 2, 1)), sigma=7e-6, **options)
 
 
+def modelled(model=None, **options):
+    """With an error model; the paper's has nothing but noise."""
+    return solved(error_model=model or ErrorModel.paper(), **options)
+
+
+def untrue():
+    """As ``overfitted``, judged by the visits themselves."""
+    cell = SimulatedCell(KUKA, {}, 3e-3)
+    return modelled(data=bare(cell.measure(random_configurations(KUKA, 4, 1), 1, 3)), sigma=3e-3)
+
+
 PROVOKED = {
     # code: (level, how)…
     "not_converged": [("FAIL", lambda: solved(iterations=1))],
@@ -174,7 +187,17 @@ PROVOKED = {
         ("WARN", lambda: solved(required_accuracy=1e-3)),
         ("PASS", lambda: validated(required=1e-3)),
         ("FAIL", lambda: validated(lambda p: shaken(p, 10 * SIGMA), required=1e-4)),
+        ("PASS", lambda: modelled(required_accuracy=1e-3)),
+        ("FAIL", lambda: modelled(sigma=None, required_accuracy=1e-6)),
     ],
+    "unproven": [("WARN", lambda: modelled(data=data_of(count=3)))],
+    "left_out": [
+        ("PASS", modelled),
+        ("WARN", lambda: modelled(sigma=SIGMA / 2)),
+        ("FAIL", lambda: modelled(sigma=SIGMA / 5)),
+    ],
+    "no_gain_left_out": [("FAIL", untrue)],
+    "error_model": [("PASS", lambda: wrong(error_model=typical()))],
     "not_validated": [("PASS", solved)],
     "no_gain_held_out": [("FAIL", overfitted)],
     "predicted_and_achieved": [
@@ -185,7 +208,7 @@ PROVOKED = {
     "region": [("WARN", lambda: validated(lambda p: shaken(p, 2 * SIGMA)))],
 }
 CASES = [(code, level, how) for code, ways in PROVOKED.items() for level, how in ways]
-USUAL = {"not_validated", "predicted_and_achieved", "correlated", "nearly_dependent"}
+USUAL = {"not_validated", "predicted_and_achieved", "correlated", "nearly_dependent", "left_out"}
 """Reasons that a clean calibration may have, all of them at PASS."""
 
 
@@ -210,6 +233,7 @@ def clean(how: str):
     poses = random_configurations(KUKA, 2, 6)
     return {
         "plain": lambda: solved(test_poses=poses),
+        "error model": lambda: modelled(typical(), test_poses=poses),
         "sigma unknown": lambda: solved(sigma=None, test_poses=poses),
         "repeated": lambda: solved(data_of(repetitions=2), test_poses=poses),
         "robust": lambda: solved(loss="robust", test_poses=poses),
@@ -220,7 +244,8 @@ def clean(how: str):
 
 
 @pytest.mark.parametrize(
-    "how", ["plain", "sigma unknown", "repeated", "robust", "validated", "cross-validated", "placed"]
+    "how",
+    ["plain", "error model", "sigma unknown", "repeated", "robust", "validated", "cross-validated", "placed"],
 )
 def test_a_clean_calibration_passes_and_says_little(how):
     found = clean(how).verdict

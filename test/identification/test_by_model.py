@@ -1,0 +1,285 @@
+"""``identify`` with an error model: the usual estimate, a left-out error, and predictions that survive a file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cells import bare, placed_cell, plain_cell
+from robots import SHARED_DATA, random_configurations
+
+from calib_planner import Estimate, IdentificationProblem, Measurements, Robot, identify, validate
+from calib_planner.compensation import compensate
+from calib_planner.error_model import ErrorModel, Knowledge
+from calib_planner.errors import InputError, NotEnoughDataError
+from calib_planner.identification import Prior, cross_validate
+from calib_planner.io import read_error_model, read_estimate, read_measurements, typical, write_estimate
+from calib_planner.io.yaml import read_document, write_document
+
+PLAIN = {"discrepancy": "off", "joint_corrections": "off", "order_check": "off", "starts": 0}
+KUKA = Robot.load("kuka_kr270")
+SIGMA = 5e-5
+POSES = np.array(
+    [
+        [0.2, -1.0, 1.2, 0.4, 0.6, 0.0],
+        [0.4, -1.3, 1.0, -0.5, 0.9, 0.3],
+        [-0.3, -0.8, 1.5, 0.1, -0.7, 0.0],
+        [0.0, -1.1, 0.7, 0.2, 1.1, -0.4],
+    ]
+)
+TARGETS = [[0.05, 0.0, 0.1], [0.0, -0.06, 0.05]]
+
+
+def points_of(known: Knowledge, q: np.ndarray, seed: int) -> Measurements:
+    """What a robot of which all is known shows, with 20 µm of noise."""
+    rng, points = np.random.default_rng(seed), known.poses(q).points
+    return Measurements(known.robot.joint_names, q, points + 2e-5 * rng.standard_normal(points.shape))
+
+
+@cache
+def bending() -> tuple[Robot, Knowledge, Measurements, Measurements]:
+    """A UR10e that bends under its weight: nominal, the truth, 40 visits, and 60 others."""
+    robot = Robot.load("ur10e").with_targets(TARGETS).with_parameters("full")
+    model = typical().without("joint_functions")
+    rng = np.random.default_rng(3)
+    true = model.with_values({"placement.length": 3e-4, "placement.angle": 6e-4, "gravity": 3e-3})
+    beta = np.sqrt(true.variances(robot)) * rng.standard_normal(len(true.variances(robot)))
+    known = Knowledge(robot, true, beta, np.zeros((len(beta),) * 2), np.zeros((len(beta), 0)))
+    asked = robot.with_parameters("full", ("base", "tool"))
+    q = random_configurations(robot, 100, 3) / 3.0
+    return asked, known, points_of(known, q[:40], 1), points_of(known, q[40:], 2)
+
+
+@cache
+def bent(**more: str) -> tuple[IdentificationProblem, Estimate]:
+    robot, _, data, _ = bending()
+    problem = IdentificationProblem(robot, data, error_model=typical(), test_poses=POSES / 2.0, **more)
+    return problem, identify(problem)
+
+
+# ── the paper's model is plain least squares ─────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("sigma", [SIGMA, None])
+def test_paper_is_plain_least_squares(sigma: float | None) -> None:
+    """(6), (7) and (11): the same numbers as with every other check switched off."""
+    cell, _ = plain_cell(2)
+    data = bare(cell.measure(random_configurations(KUKA, 25, 2), 1, 2))
+    plain = identify(IdentificationProblem(KUKA, data, sigma, test_poses=POSES, **PLAIN))
+    paper = identify(IdentificationProblem(KUKA, data, sigma, test_poses=POSES, error_model=ErrorModel.paper()))
+    assert paper.fit.status == "ok" and paper.observability.rank == len(KUKA.parameter_names)
+    np.testing.assert_allclose(paper.fit.deviations, plain.fit.deviations, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(paper.fit.std, plain.fit.std, rtol=1e-4)
+    np.testing.assert_allclose(paper.accuracy.predicted, plain.accuracy.predicted, rtol=1e-4)
+    np.testing.assert_allclose(paper.residuals.vectors, plain.residuals.vectors, atol=1e-9)
+    assert paper.residuals.before.rms == pytest.approx(plain.residuals.before.rms, rel=1e-9)
+    assert not paper.points.rejected
+
+
+def test_paper_leaves_out_the_same_parameters() -> None:
+    """Base and tool unknown: what nothing tells stays fixed, and predictions are those of least squares."""
+    cell, asked = placed_cell(3)
+    data = bare(cell.measure(random_configurations(asked, 30, 3), 1, 3))
+    plain = identify(IdentificationProblem(asked, data, SIGMA, test_poses=POSES, **PLAIN))
+    paper = identify(IdentificationProblem(asked, data, SIGMA, test_poses=POSES, error_model=ErrorModel.paper()))
+    assert paper.fit.status == plain.fit.status == "rank_deficient"
+    assert paper.observability.rank == plain.observability.rank
+    assert (
+        len(paper.observability.fixed)
+        == len(plain.observability.fixed)
+        == len(paper.observability.unidentifiable)
+    )
+    np.testing.assert_allclose(paper.positions(POSES), plain.positions(POSES), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(paper.accuracy.predicted, plain.accuracy.predicted, rtol=1e-4)
+    fixed = [paper.fit.parameters.index(n) for n in paper.observability.fixed]
+    assert np.isnan(paper.fit.std[fixed]).all() and not paper.fit.deviations[fixed].any()
+
+
+def test_what_no_visit_shows_makes_the_accuracy_infinite() -> None:
+    q = np.repeat(random_configurations(KUKA, 1, 5), 15, axis=0)
+    q[:, 0] = np.linspace(-1, 1, 15)
+    cell, _ = plain_cell(1)
+    data = bare(cell.measure(q, 1, 5))
+    found = identify(IdentificationProblem(KUKA, data, SIGMA, test_poses=POSES, error_model=ErrorModel.paper()))
+    assert np.isinf(found.accuracy.predicted).all() and found.verdict.level == "FAIL"
+
+
+# ── all terms ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_robot_that_bends_is_predicted_as_well_as_promised() -> None:
+    problem, estimate = bent()
+    _, _, _, others = bending()
+    assert estimate.fit.status == "ok" and estimate.verdict.level == "PASS"
+    assert estimate.error_model is not None
+    gravity = next(t for t in estimate.error_model.terms if t.name == "gravity")
+    assert gravity.kept and gravity.gain > 10.0 and gravity.size > 2e-4 and 0.0 < gravity.std < gravity.size
+    left = estimate.error_model.left_out
+    assert left.count == 80 and 0.8 < left.predicted_rms / left.rms < 1.25
+    judged = validate(problem, estimate, [others])
+    assert judged.validation is not None
+    achieved = judged.validation
+    assert achieved.count == 120 and achieved.rms < 0.15 * achieved.geometry_rms
+    assert 0.8 < achieved.predicted_rms / achieved.rms < 1.25 and achieved.within_95 > 0.9
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(np.sum((others.p - estimate.positions(others.q)) ** 2, axis=2))), achieved.rms
+    )
+
+
+def test_the_accuracy_of_the_robot_alone_needs_no_registration() -> None:
+    _, world = bent()
+    _, robot = bent(accuracy_frame="robot")
+    assert robot.error_model is not None and robot.to_dict()["accuracy_frame"] == "robot"
+    assert 0.0 < robot.accuracy.overall < world.accuracy.overall
+    np.testing.assert_array_equal(robot.fit.deviations, world.fit.deviations)
+
+
+def test_points_that_are_impossible_are_rejected_with_their_rows() -> None:
+    robot, _, data, _ = bending()
+    points = np.array(data.p)
+    points[7, 1] += [0.0, 4e-3, 0.0]
+    points[20, 0] = np.nan
+    found = identify(IdentificationProblem(robot, bare(data, points), error_model=typical()))
+    point = next(p for p in found.points.rejected if (p.row, p.target) == (7, 2))
+    assert point.residual == pytest.approx(4e-3, abs=2e-4) and point.normalised_residual > found.residuals.gate
+    assert found.points.measured == 79 and 70 < found.points.used == 79 - len(found.points.rejected)
+    assert np.isnan(found.residuals.normalised[20, 0])
+
+
+def test_a_target_that_was_put_on_anew_is_told_by_a_few_rows() -> None:
+    problem, estimate = bent()
+    _, known, _, others = bending()
+    moved = replace(known, robot=known.robot.with_targets([[0.0, 0.1, 0.12]]).with_parameters("full"))
+    fresh = points_of(moved, np.asarray(others.q), 5)
+    found = validate(problem, estimate, [fresh], 2).validation
+    assert found is not None and found.count == 58
+    assert found.rms < 2.0 * found.predicted_rms < 4e-4 and found.geometry_rms > 2.0 * found.rms
+
+
+def test_the_irb120_is_predicted_within_what_was_promised() -> None:
+    """36 × 3 points → 40 rows of a re-seated target; the rows decide nothing but its seat."""
+    folder = SHARED_DATA / "irb120_tracker"
+    if not folder.is_dir():
+        pytest.skip("no measured data beside the repository")
+    robot = Robot.load(folder / "irb120.urdf").with_targets(np.zeros((3, 3)))
+    robot = robot.with_parameters("full", ("base", "tool"))
+    problem = IdentificationProblem(
+        robot, read_measurements(folder / "calibration.csv", robot).data, error_model=typical()
+    )
+    one = robot.with_targets(np.zeros((1, 3)))
+    held_out = [read_measurements(folder / f"test_{k}.csv", one).data for k in (1, 2)]
+    found = validate(problem, identify(problem), held_out, 1)
+    assert found.validation is not None
+    assert found.validation.count == 40 and found.validation.mean <= 1.45e-4
+    assert 0.7 < found.validation.predicted_rms / found.validation.rms < 1.6
+
+
+# ── files ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    write_estimate(tmp_path / "e.yaml", bent()[1])
+    return tmp_path / "e.yaml"
+
+
+def test_what_was_saved_predicts_the_same(saved: Path) -> None:
+    estimate, robot = bent()[1], Robot.load("ur10e")
+    assert estimate.error_model is not None
+    known, again = estimate.error_model.knowledge, read_estimate(saved).knowledge(robot)
+    before, after = known.predict(POSES), again.predict(POSES)
+    np.testing.assert_allclose(after.mean, before.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(after.total, before.total, rtol=1e-12, atol=0)
+    for frame in ("world", "robot"):
+        assert again.accuracy(POSES, frame).value == pytest.approx(known.accuracy(POSES, frame).value, rel=1e-12)
+    assert again.model == known.model == read_error_model(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda e: e.update(covariance="no base64"), "error_model.covariance"),
+        (lambda e: e.update(covariance=e["covariance"][:64]), "finite ones"),
+        (lambda e: e["coefficients"].pop(), "error_model.coefficients"),
+        (lambda e: e.pop("start"), "start"),
+        (lambda e: e["model"].pop("visits"), "visits"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_its_key(saved: Path, change, text: str) -> None:  # type: ignore[no-untyped-def]
+    document = dict(read_document(saved, "estimate").value)
+    change(document["error_model"])
+    write_document(saved, "estimate", document)
+    with pytest.raises(InputError, match=text):
+        read_estimate(saved)
+
+
+def test_another_robot_is_refused(saved: Path) -> None:
+    with pytest.raises(InputError):
+        read_estimate(saved).knowledge(KUKA)
+
+
+def test_compensated_targets_put_the_bent_robot_where_it_should_be(saved: Path) -> None:
+    """The true robot is the judge, and what a registration of its base explains is no error."""
+    nominal, (_, truth, _, _) = Robot.load("ur10e").with_targets(TARGETS[:1]), bending()
+    estimate = read_estimate(saved)
+    q = random_configurations(nominal, 20, 9) / 4.0
+    made = compensate(
+        nominal, estimate.calibrated(nominal), q, position_only=True, corrections=estimate.knowledge(nominal)
+    )
+    assert (made.position_error < 1e-8).all()
+    known = estimate.knowledge(nominal)
+    np.testing.assert_allclose(known.actual(known.reading(q)), q, rtol=0, atol=1e-14)
+    point = np.array(estimate.targets)[:1]
+    deflected = replace(truth, robot=truth.robot.with_targets(point))
+    reached = deflected.poses(made.corrected).points[:, 0]
+    wanted = nominal.with_targets(point).positions(q)[:, 0]
+    uncorrected = deflected.poses(q).points[:, 0]
+
+    def apart(points: np.ndarray) -> float:
+        """Rms after a registration of the robot anew: a rigid motion is no error of its own."""
+        a, b = points - points.mean(axis=0), wanted - wanted.mean(axis=0)
+        u, _, vt = np.linalg.svd(a.T @ b)
+        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        return float(np.sqrt(np.mean(np.sum((a @ turn - b) ** 2, axis=1))))
+
+    assert apart(reached) < 0.3 * apart(uncorrected)
+
+
+# ── what makes no sense together ─────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("field", "options"),
+    [
+        ("loss", {"loss": "robust"}),
+        ("discrepancy", {"discrepancy": "off"}),
+        ("joint_corrections", {"joint_corrections": "off"}),
+        ("starts", {"starts": 5}),
+        ("prior", {"prior": Prior(("joint_2.x",), [0.0], [1e-3], "a prior")}),
+        ("accuracy_frame", {"accuracy_frame": "tool"}),
+        ("test_poses", {"accuracy_frame": "robot", "test_poses": POSES[:3]}),
+        ("test_poses", {"accuracy_frame": "robot"}),
+        ("test_poses", {"accuracy_frame": "robot", "test_poses": np.zeros((5, 6))}),
+        ("accuracy_frame", {"accuracy_frame": "robot", "error_model": None, "test_poses": POSES}),
+    ],
+)
+def test_refused_beside_an_error_model(field: str, options: dict[str, object]) -> None:
+    robot, _, data, _ = bending()
+    with pytest.raises(InputError) as error:
+        IdentificationProblem(robot, data, **{"error_model": typical()} | options)
+    assert error.value.field == field
+
+
+def test_folds_are_refused() -> None:
+    with pytest.raises(InputError, match="left-out error"):
+        cross_validate(*bent())
+
+
+def test_too_few_points_for_plain_least_squares() -> None:
+    cell, _ = plain_cell(1)
+    data = bare(cell.measure(random_configurations(KUKA, 2, 1), 1, 1))
+    with pytest.raises(NotEnoughDataError):
+        identify(IdentificationProblem(KUKA, data, error_model=ErrorModel.paper()))
