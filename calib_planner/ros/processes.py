@@ -194,15 +194,24 @@ def _abort(process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Ignore Ctrl-C meanwhile: a second one must not leave nodes behind."""
+    """Let Ctrl-C wait meanwhile: it must not leave nodes behind, and it is not lost either.
+
+    Raises:
+        KeyboardInterrupt: Afterwards, if a signal came that this process handles.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    came: list[int] = []
+    handled = [n for n in (signal.SIGINT, signal.SIGTERM) if callable(signal.getsignal(n))]
+    before = {n: signal.signal(n, lambda number, frame: came.append(number)) for n in handled}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def node_names() -> Sequence[str]:

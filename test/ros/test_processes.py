@@ -97,6 +97,19 @@ def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
         assert nodes.processes == {} == nodes.end()
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_nodes_are_ended_waits_and_is_not_lost(number: signal.Signals) -> None:
+    outer = signal.signal(number, signal.default_int_handler)
+    ended = False
+    try:
+        with pytest.raises(KeyboardInterrupt), processes._undisturbed():
+            os.kill(os.getpid(), number)
+            ended = True
+        assert ended and signal.getsignal(number) is signal.default_int_handler
+    finally:
+        signal.signal(number, outer)
+
+
 def test_a_module_that_is_none_is_refused() -> None:
     command = [sys.executable, "-m", "calib_planner.ros.processes", "../planner_node"]
     ended = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
