@@ -221,7 +221,8 @@ class _Work:
         doubt[run] = np.where(self.data.seen[run], min(far, LARGEST * own), 0.0)
         self.state = replace(self.state, doubt=np.maximum(doubt, self.state.doubt))
         without = self.settle(MOST_ROUNDS)
-        shift = left_out(without).residuals[run][self.data.seen[run]].mean(axis=0)
+        # The median: one gross point does not make a shift of the visits beside it.
+        shift = np.median(left_out(without).residuals[run][self.data.seen[run]], axis=0)
         rest = without.problem.covariance[np.setdiff1d(np.arange(len(doubt)), run)]
         std = np.sqrt(np.median(np.trace(rest, axis1=1, axis2=2)) / doubt.shape[1])
         if np.linalg.norm(shift) > MATERIAL * std:
