@@ -33,7 +33,7 @@ from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 
 IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
-SIMULATOR = {"robot": "planar_2r", "joint_speed": 50.0, "dwell": 0.7, "seed": 3}
+SIMULATOR = {"robot": "planar_2r", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 
 
 @pytest.fixture
@@ -68,8 +68,14 @@ def test_a_campaign_with_simulator_and_identifier(bench: Bench, tmp_path: Path) 
     off = found.deviations - [truth[n] for n in found.parameters]
     seen = np.isfinite(found.std)
     assert (np.abs(off[seen]) < 4 * found.std[seen]).all() and estimates[-1].verdict == done.verdict
-    # In the end the identifier's own estimate is that of the fit, too.
-    bench.wait(lambda: "-fit-" in identified[-1].plan_id and identified[-1].measurements == done.measured)
+    # In the end the identifier's own estimate is that of the fit, too. A point may be an outlier by chance: the
+    # campaign counts it as measured, the identifier counts it apart.
+    bench.wait(
+        lambda: (
+            "-fit-" in identified[-1].plan_id
+            and identified[-1].measurements + identified[-1].outliers == done.measured
+        )
+    )
     names = sorted(p.name for p in tmp_path.iterdir())
     ids = {n: f"{n}_{done.campaign_id}" for n in ("measurements", "validation", "estimate")}
     assert set(names) == {

@@ -28,7 +28,7 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 16})
         nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
-        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 50.0, "dwell": 0.7})
+        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7})
         client = DemoClient(domain, nodes.check)
         try:
             request = PlanCalibration.Request(
