@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from calib_planner import Robot
-from calib_planner.error_model import ErrorModel, Knowledge
+from calib_planner.error_model import ErrorModel, Knowledge, typical
 from calib_planner.identification import ModelEstimate, fit_error_model
-from calib_planner.io import read_measurements, typical
+from calib_planner.io import read_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.tracker import Isotropic, LaserTracker, Noise
 

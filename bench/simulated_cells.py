@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from calib_planner import IdentificationProblem, Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.identification import Estimate, Prior, start_robot
+from calib_planner.error_model import Prior
+from calib_planner.identification import Estimate, start_robot
 from calib_planner.measurements import Measurements
 from calib_planner.robot import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations

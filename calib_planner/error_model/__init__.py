@@ -10,5 +10,7 @@ from calib_planner.error_model.model import ErrorModel, Scale
 from calib_planner.error_model.placement import Placement
 from calib_planner.error_model.points import Points
 from calib_planner.error_model.poses import Poses
+from calib_planner.error_model.prior import Prior
 from calib_planner.error_model.saved import from_mapping, to_mapping
+from calib_planner.error_model.typical import typical
 from calib_planner.error_model.visits import Visits

@@ -247,7 +247,7 @@ class Knowledge:
 
 def prior_information(robot: Robot, model: ErrorModel) -> FloatArray:
     """M₀ (coefficients, coefficients), zero where flat."""
-    return np.diag(1.0 / model.variances(robot))
+    return model.precision(robot)
 
 
 def information(robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None) -> FloatArray:

@@ -143,8 +143,8 @@ class ErrorModel:
 
     @property
     def is_papers(self) -> bool:
-        """Whether it is plain least squares: nothing but flat parameters and noise."""
-        return self.placement.prior == "flat" and not self.placement.stated and len(self.terms) == 2
+        """Whether it has nothing but parameters and noise, as the paper's."""
+        return len(self.terms) == 2
 
     @property
     def systematic(self) -> tuple[Placement | Gravity | JointFunctions, ...]:
@@ -189,8 +189,22 @@ class ErrorModel:
         return total
 
     def variances(self, robot: Robot) -> FloatArray:
-        """(coefficients,) prior variances, infinite where flat [unit²]; M₀ is the diagonal of their inverses."""
+        """(coefficients,) prior variances, infinite where flat [unit²]; see ``precision`` for M₀."""
         return np.concatenate([term.variances(robot, self.values) for term in self.systematic])
+
+    def means(self, robot: Robot) -> FloatArray:
+        """(coefficients,) prior means of β [unit]; 0 but for parameters of which the user states something."""
+        means = np.zeros(sum(term.size(robot) for term in self.systematic))
+        means[: self.placement.size(robot)] = self.placement.means(robot)
+        return means
+
+    def precision(self, robot: Robot) -> FloatArray:
+        """M₀ (coefficients, coefficients), zero where the prior is flat [1/unit²]."""
+        matrix, stated = np.diag(1.0 / self.variances(robot)), self.placement.stated
+        if stated is not None:
+            places = np.ix_(*[stated.places(robot.parameter_names)] * 2)
+            matrix[places] = np.linalg.inv(np.asarray(stated.covariance))
+        return matrix
 
     def gradients(self, robot: Robot) -> dict[str, FloatArray]:
         """Scale → (coefficients,) derivative of ``variances`` by its logarithm, for scales that are not known."""

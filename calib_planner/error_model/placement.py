@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model.poses import Poses
-from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.error_model.prior import Prior
+from calib_planner.errors import UnknownNameError
 from calib_planner.robot import Robot
 
 ZERO = 0.02
@@ -35,11 +36,11 @@ class Placement:
 
     Attributes:
         prior: ``tolerance`` or ``flat``.
-        stated: Standard deviations that the user knows, as (parameter name, standard deviation [m | rad]).
+        stated: What the user knows of some parameters, in place of their tolerance; ``None``: nothing.
     """
 
     prior: str = "tolerance"
-    stated: tuple[tuple[str, float], ...] = ()
+    stated: Prior | None = None
 
     name: ClassVar[str] = "placement"
     title: ClassVar[str] = "lengths, axes and zeros of the chain"
@@ -47,12 +48,6 @@ class Placement:
     def __post_init__(self) -> None:
         if self.prior not in PRIORS:
             raise UnknownNameError("placement.prior", self.prior, PRIORS)
-        names = [name for name, _ in self.stated]
-        if len(set(names)) < len(names):
-            raise InputError("placement.stated", ", ".join(names), "every parameter once")
-        for name, std in self.stated:
-            if not 0.0 < std < np.inf:
-                raise InputError(f"prior of {name}", std, "a standard deviation > 0 [m | rad]")
 
     @property
     def scales(self) -> tuple[str, ...]:
@@ -78,11 +73,18 @@ class Placement:
             variances[rows] = values[name] ** 2
         if self.prior == "tolerance":
             variances[joint_zeros(robot)] = ZERO**2
-        for name, std in self.stated:
-            if name not in robot.parameter_names:
-                raise UnknownNameError("prior", name, robot.parameter_names)
-            variances[robot.parameter_names.index(name)] = std**2
+        if self.stated is not None:
+            variances[self.stated.places(robot.parameter_names)] = self.stated.std**2
         return variances
+
+    def means(self, robot: Robot) -> FloatArray:
+        """(P,) expected deviations from the nominal values [m | rad]; 0 where nothing is stated."""
+        means = np.zeros(len(robot.parameter_names))
+        if self.stated is not None:
+            places = self.stated.places(robot.parameter_names)
+            nominal = np.array([p.nominal for p in robot.parameters])
+            means[places] = np.asarray(self.stated.values) - nominal[places]
+        return means
 
     def gradients(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (P,) derivative of ``variances`` by its logarithm."""
@@ -96,7 +98,8 @@ class Placement:
     def _rows(self, robot: Robot) -> dict[str, BoolArray]:
         """Scale → (P,) whether a parameter's prior is that scale."""
         free = is_placement(robot.parameter_names) & ~joint_zeros(robot)
-        free &= np.array([n not in dict(self.stated) for n in robot.parameter_names], bool)
+        if self.stated is not None:
+            free[self.stated.places(robot.parameter_names)] = False
         angle = np.array([p.unit == "rad" for p in robot.parameters], bool)
         rows = {"placement.length": free & ~angle, "placement.angle": free & angle}
         return {n: r for n, r in rows.items() if n in self.scales and r.any()}

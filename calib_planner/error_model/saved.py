@@ -17,6 +17,7 @@ from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.model import ErrorModel, Scale
 from calib_planner.error_model.placement import Placement
 from calib_planner.error_model.points import Points
+from calib_planner.error_model.prior import Prior
 from calib_planner.error_model.visits import Visits
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.tracker import Isotropic, LaserTracker, Noise
@@ -32,7 +33,7 @@ def to_mapping(model: ErrorModel) -> dict[str, Any]:
         points["noise"] = _noise_mapping(model.points.noise)
     return {
         "name": model.name,
-        "placement": {"prior": model.placement.prior, "stated": dict(model.placement.stated)},
+        "placement": {"prior": model.placement.prior, "stated": _prior_mapping(model.placement.stated)},
         "gravity": None if gravity is None else _plain(asdict(gravity)),
         "joint_functions": None if functions is None else _plain(asdict(functions)),
         "visits": None if visits is None else asdict(visits),
@@ -61,7 +62,7 @@ def from_mapping(data: Mapping[str, Any], field: str = "error_model") -> ErrorMo
         functions = _optional(field, data, "joint_functions", {"components", "harmonics"})
         visits = _optional(field, data, "visits", {"joints", "shared"})
         return ErrorModel(
-            placement=Placement(placement["prior"], tuple(dict(placement["stated"]).items())),
+            placement=Placement(placement["prior"], _prior(f"{field}.placement.stated", placement["stated"])),
             gravity=None if gravity is None else _gravity(f"{field}.gravity", gravity),
             joint_functions=None
             if functions is None
@@ -76,6 +77,18 @@ def from_mapping(data: Mapping[str, Any], field: str = "error_model") -> ErrorMo
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         advice = "compare with config/error_models/typical.yaml or save the model anew"
         raise InputError(field, f"{type(error).__name__}: {error}", "a saved error model", advice) from None
+
+
+def _prior_mapping(stated: Prior | None) -> dict[str, Any] | None:
+    return None if stated is None else _plain(asdict(stated))
+
+
+def _prior(field: str, data: Mapping[str, Any] | None) -> Prior | None:
+    if not data:
+        return None
+    keys = {f.name for f in fields(Prior)}
+    _check_keys(field, data, keys, keys)
+    return Prior(tuple(data["names"]), data["values"], data["covariance"], str(data["source"]))
 
 
 def _gravity(field: str, data: Mapping[str, Any]) -> Gravity:

@@ -140,7 +140,8 @@ class _Work:
             parts = parts | {"doubt": part_of(state.doubt)}
         both = seen[:, :, None] * seen[:, None, :]
         parts = {n: p * both for n, p in parts.items()}
-        y = apart + columns[:, :, random] @ state.coefficients[random]
+        beyond = state.coefficients[random] - state.model.means(self.robot)[random]
+        y = apart + columns[:, :, random] @ beyond
         return LinearProblem(self.robot, state.model, y, columns, parts, seen)
 
     def accept(self, solution: Solution) -> bool:
@@ -148,6 +149,7 @@ class _Work:
         problem, old = solution.problem, self.state.coefficients
         new = solution.coefficients.copy()
         new[problem.flat] += old[problem.flat]
+        new[problem.random] += problem.means
         step = new - old
         change = np.abs(problem.columns @ step)
         shares = (1.0, 0.5, 0.25, 0.1, 0.03) if change.max() > BENT else (1.0,)
@@ -166,7 +168,7 @@ class _Work:
         """What least squares minimises, through the kinematics and not its linearisation."""
         apart = np.where(self.data.seen[:, :, None], self.data.p - self._poses(coefficients).points, 0.0)
         flat = apart.reshape(len(apart), -1, 1)
-        prior = np.sum((coefficients[problem.random] / problem.root) ** 2, where=problem.root > 0.0)
+        prior = np.sum(problem.standard(coefficients[problem.random] - problem.means) ** 2)
         return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
 
     def _poses(self, coefficients: FloatArray) -> Poses:

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from calib_planner.arrays import FloatArray, IntArray
-from calib_planner.identification.problem import Prior
+from calib_planner.error_model import Prior
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 

@@ -57,7 +57,7 @@ class LinearProblem:
     Attributes:
         robot: At which it was linearised.
         model: Its scales are those of ``parts``.
-        y: (N, m) measured − predicted + B u₀ [m], zero where not measured.
+        y: (N, m) measured − predicted + B (u₀ − ū) [m], ū the prior's means; zero where not measured.
         columns: (N, m, coefficients) J⁺, zero rows where not measured.
         parts: Scale → (N, m, m) its part of R_i, zero rows and columns where not measured [m²].
         seen: (N, m) 1 where measured.
@@ -105,13 +105,46 @@ class LinearProblem:
 
     @cached_property
     def root(self) -> FloatArray:
-        """(K,) Λ^½."""
+        """(K,) Λ^½; of parameters with a stated prior the roots of its variances."""
         return np.sqrt(self.model.variances(self.robot)[self.random])
+
+    @cached_property
+    def means(self) -> FloatArray:
+        """(K,) expected u, zero where nothing is stated."""
+        return self.model.means(self.robot)[self.random]
+
+    @cached_property
+    def stated(self) -> tuple[IntArray, FloatArray] | None:
+        """Which of the K have a stated prior, and the root L (stated, stated) of its covariance, if any has."""
+        prior = self.model.placement.stated
+        if prior is None:
+            return None
+        return np.searchsorted(self.random, prior.places(self.robot.parameter_names)), prior.root
+
+    def spread(self, standard: FloatArray) -> FloatArray:
+        """Λ^½ · standard, (K, …): what it adds to u."""
+        result = (self.root * standard.T).T
+        if self.stated is not None:
+            places, root = self.stated
+            result[places] = root @ standard[places]
+        return result
+
+    def standard(self, u: FloatArray) -> FloatArray:
+        """Λ^-½ u (K,): the inverse; 0 for terms that vanished."""
+        result = np.divide(u, self.root, out=np.zeros(len(u)), where=self.root > 0.0)
+        if self.stated is not None:
+            places, root = self.stated
+            result[places] = np.linalg.solve(root, u[places])
+        return result
 
     @cached_property
     def scaled_columns(self) -> FloatArray:
         """(N·m, K) B Λ^½."""
-        return self.random_columns * self.root
+        result = self.random_columns * self.root
+        if self.stated is not None:
+            places, root = self.stated
+            result[:, places] = self.random_columns[:, places] @ root
+        return result
 
     @cached_property
     def ratios(self) -> dict[str, FloatArray]:
@@ -125,7 +158,7 @@ class LinearProblem:
         rank = self.basis.shape[1]
         result = np.zeros((self.columns.shape[2], *reduced.shape[1:]))
         result[self.flat] = self.basis @ reduced[:rank]
-        result[self.random] = (self.root * reduced[rank:].T).T
+        result[self.random] = self.spread(reduced[rank:])
         return result
 
     @cached_property
@@ -151,7 +184,7 @@ class Solution:
     Attributes:
         problem: What was solved.
         value: −2 log L of (2) or (3), constants left out.
-        coefficients: (coefficients,) γ̂ as Z γ̂, and û; flat ones are changes from where it was linearised.
+        coefficients: (coefficients,) γ̂ as Z γ̂, and û − ū; flat ones are changes from where it was linearised.
         weighted: (N, m) P y [1/m].
         blocks: (N, m, m) P_ii [1/m²].
         squares: (K,) λ_k b_kᵀ P b_k.

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_triangular
 
-from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
-from calib_planner.error_model import ACCURACIES, ErrorModel, without_rigid_motion
+from calib_planner.arrays import FloatArray, check_configurations, check_count, check_number
+from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, without_rigid_motion
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot, is_nuisance
@@ -154,74 +153,12 @@ class IdentificationProblem:
         return np.broadcast_to(UNKNOWN_SIGMA**2 * np.eye(3), shape), "residuals"
 
 
-# ── What is known of the parameters before the data: a Gaussian, Π_k ~ N(m, C) ──────────────────────────────
-# A prior adds equations to the least squares (maximum a posteriori): with C = L Lᵀ, rows L⁻¹ against L⁻¹ (m − Π).
-# It determines parameters that the data hardly see, at the cost of a little bias in the others.
-
 LENGTH_STD = 5e-4
 """Typical deviation of the lengths of an assembled industrial robot from the data sheet [m]."""
 ANGLE_STD = 1e-3
 """The same for angles between axes [rad]."""
 OFFSET_STD = 0.02
 """The same for the zero positions of joints, which are set by hand [rad | m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Expected values and their covariance.
-
-    Attributes:
-        names: K parameter names, each once.
-        values: (K,) expected values, not deviations [m | rad].
-        covariance: (K, K), or (K,) standard deviations of independent parameters [m | rad].
-        source: Where it comes from, in words.
-    """
-
-    names: tuple[str, ...]
-    values: ArrayLike
-    covariance: ArrayLike
-    source: str = "given"
-
-    def __post_init__(self) -> None:
-        put = object.__setattr__
-        put(self, "names", tuple(self.names))
-        count = len(self.names)
-        if not count or len(set(self.names)) < count:
-            raise InputError("prior.names", ", ".join(self.names) or "nothing", "parameter names, each once")
-        put(self, "values", check_array("prior.values", self.values, (count,)))
-        covariance = np.asarray(self.covariance, float)
-        if covariance.ndim == 1:
-            std = check_array("prior.std", covariance, (count,))
-            if (std <= 0).any():
-                name = self.names[int(np.argmin(std))]
-                raise InputError(f"prior.std of {name}", std.min(), "a standard deviation > 0 [m | rad]")
-            covariance = np.diag(std**2)
-        covariance = check_array("prior.covariance", covariance, (count, count))
-        scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        unit = covariance / np.where(np.outer(scale, scale) > 0, np.outer(scale, scale), 1.0)
-        if (scale == 0).any() or not np.allclose(unit, unit.T, atol=1e-9) or np.linalg.eigvalsh(unit)[0] <= 1e-14:
-            raise InputError("prior.covariance", "not positive definite", "a symmetric positive definite matrix")
-        put(self, "covariance", covariance)
-
-    def rows(self, names: Sequence[str], values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The prior as equations for parameters ``names`` (P) now at ``values`` (P,).
-
-        Returns:
-            (K, P) whitened rows and (K,) right-hand sides: rows · ΔΠ = right.
-
-        Raises:
-            UnknownNameError: The prior speaks of a parameter that is not among ``names``.
-        """
-        for name in self.names:
-            if name not in names:
-                raise UnknownNameError("prior", name, list(names))
-        at = [list(names).index(n) for n in self.names]
-        scale = np.sqrt(np.diag(np.asarray(self.covariance)))
-        lower = np.linalg.cholesky(np.asarray(self.covariance) / np.outer(scale, scale))
-        inverse = solve_triangular(lower, np.diag(1.0 / scale), lower=True)
-        rows = np.zeros((len(at), len(names)))
-        rows[:, at] = inverse
-        return rows, inverse @ (np.asarray(self.values) - values[at])
 
 
 def typical_prior(robot: Robot, length_std: float = LENGTH_STD, angle_std: float = ANGLE_STD) -> Prior | None:

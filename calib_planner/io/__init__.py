@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         write_configurations,
         write_measurements,
     )
-    from calib_planner.io.error_model import read_error_model, typical, write_error_model
+    from calib_planner.io.error_model import read_error_model, write_error_model
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
     from calib_planner.io.kinematics import read_kinematics, write_kinematics
     from calib_planner.io.plan import (
@@ -77,7 +77,7 @@ else:
             "conditions": "read_constraints read_instrument",
             "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
             "read_plan_csv write_configurations write_measurements",
-            "error_model": "read_error_model typical write_error_model",
+            "error_model": "read_error_model write_error_model",
             "estimate": "calibrated_robot placement read_estimate write_estimate",
             "kinematics": "read_kinematics write_kinematics",
             "plan": "SHARE SHEET_FILES WORDS read_plan robot_pace write_plan write_sheet_csv write_sheet_yaml "

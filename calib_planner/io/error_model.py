@@ -1,26 +1,14 @@
 """Error models as files: what is expected of a robot that nobody has measured, and what an estimate has learnt.
 
-``config/error_models/typical.yaml`` holds the typical scales of the terms. A model is saved alone
-(``write_error_model``); its mapping is the same inside an estimate.
+A model is saved alone (``write_error_model``); its mapping is the same inside an estimate.
+``config/error_models/typical.yaml`` is ``error_model.typical`` as a file to begin from.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
-from calib_planner.error_model import (
-    ErrorModel,
-    Gravity,
-    JointFunctions,
-    Placement,
-    Points,
-    Scale,
-    Visits,
-    from_mapping,
-    to_mapping,
-)
-from calib_planner.io.robots import config_folder
+from calib_planner.error_model import ErrorModel, from_mapping, to_mapping, typical
 from calib_planner.io.yaml import Node, read_document, read_yaml, write_document
 from calib_planner.tracker import Noise
 
@@ -64,35 +52,3 @@ def _saved(path: str | Path) -> Node:
         advice = "give an estimate that identify --error-model wrote"
         raise part.error("nothing", "the error model of the estimate", advice)
     return part["model"]
-
-
-def typical(
-    noise: Noise | None = None,
-    *,
-    placement: Placement | None = None,
-    gravity: Gravity | None = None,
-    estimate_scale: bool = False,
-) -> ErrorModel:
-    """All terms with typical scales.
-
-    Args:
-        noise: The instrument, if it is known.
-        placement: What is known of the chain; default: typical tolerances.
-        gravity: What hangs on the joints and how the robot is mounted; default: unknown masses, on the floor.
-        estimate_scale: Whether the data decide by which factor the instrument's statement is wrong.
-    """
-    placed = Placement() if placement is None else placement
-    elastic = Gravity() if gravity is None else gravity
-    points = Points(noise, estimate_scale)
-    scales = typical_scales()
-    return ErrorModel(placed, elastic, JointFunctions(), Visits(), points, scales, "typical")
-
-
-@cache
-def typical_scales() -> tuple[Scale, ...]:
-    """The scales of the shipped file, each at its median."""
-    file = read_yaml(config_folder() / "error_models" / "typical.yaml", "the typical error model")
-    return tuple(
-        Scale(name, row["median"].number(), row["median"].number(), row["factor"].number(), row["unit"].text())
-        for name, row in file["scales"].entries()
-    )

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calib_planner.error_model import Prior
 from calib_planner.errors import UnknownNameError
-from calib_planner.identification import Prior
 from calib_planner.io.estimate import parse_estimate
 from calib_planner.io.yaml import Node, read_yaml
 from calib_planner.robot import BASE, BASE_PARAMETERS, TARGET, Parameter, Robot, role_of, target_parameters

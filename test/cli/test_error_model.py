@@ -12,8 +12,8 @@ from identify_runs import Run, fails, small_data
 from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations
 
 from calib_planner.cli import main
+from calib_planner.error_model import typical
 from calib_planner.io import read_estimate, write_configurations, write_error_model, write_measurements
-from calib_planner.io.error_model import typical
 from calib_planner.simulation import SimulatedCell
 
 FOLDER = SHARED_DATA / "irb120_tracker"

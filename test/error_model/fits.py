@@ -9,11 +9,10 @@ from robots import random_configurations
 
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, JointFunctions, Placement
+from calib_planner.error_model import ErrorModel, JointFunctions, Placement, typical
 from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.identification.estimation import _Work
 from calib_planner.identification.likelihood import LinearProblem
-from calib_planner.io import typical
 from calib_planner.measurements import Measurements
 
 TARGETS = [[0.0, 0.05, 0.1], [0.08, -0.03, 0.05], [-0.04, 0.02, 0.12]]

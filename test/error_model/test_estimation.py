@@ -13,9 +13,8 @@ from robots import SHARED_DATA, random_configurations
 
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Gravity
+from calib_planner.error_model import ErrorModel, Gravity, typical
 from calib_planner.identification import ModelEstimate, fit_error_model
-from calib_planner.io import typical
 from calib_planner.measurements import Measurements
 from calib_planner.tracker import Isotropic
 

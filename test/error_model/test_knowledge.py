@@ -10,11 +10,10 @@ from robots import mixed, random_configurations
 
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points
+from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points, Prior, typical
 from calib_planner.error_model.knowledge import Knowledge, prior_information
 from calib_planner.error_model.knowledge import information as information_of
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.io import typical
 from calib_planner.tracker import Isotropic, LaserTracker
 
 SIGMA = 3e-5
@@ -73,12 +72,11 @@ def test_the_order_of_the_parameters_changes_nothing() -> None:
 def test_more_knowledge_never_raises_an_accuracy(seed: int) -> None:
     robot = kr270("full", ("base", "tool"))
     q, test, model = poses_of(robot, 16, seed), poses_of(robot, 6, 50 + seed), slim()
+    stated = Placement(stated=Prior((robot.parameter_names[9],), [0.0], [1e-6]))
     more = {
         "start": Knowledge.of_plan(robot, model, q[:12]),
         "visits": Knowledge.of_plan(robot, model, q),
-        "prior": Knowledge.of_plan(
-            robot, replace(model, placement=Placement(stated=((robot.parameter_names[9], 1e-6),))), q[:12]
-        ),
+        "prior": Knowledge.of_plan(robot, replace(model, placement=stated), q[:12]),
         "repetitions": Knowledge.of_plan(robot, model, q[:12], repetitions=3),
         "smaller terms": Knowledge.of_plan(
             robot, model.with_values({"gravity": 1e-5, "smooth.size": 1e-6}), q[:12]

@@ -10,7 +10,7 @@ import pytest
 from fits import problem_of, simulated, total_covariance, unknown, ur10e
 from robots import random_configurations
 
-from calib_planner.error_model import ErrorModel, Placement
+from calib_planner.error_model import ErrorModel, Placement, typical
 from calib_planner.identification.estimation import _Work, fit_error_model
 from calib_planner.identification.left_out import left_out
 from calib_planner.identification.likelihood import (
@@ -25,7 +25,6 @@ from calib_planner.identification.likelihood import (
     unknown_scales,
     with_uncertain_scales,
 )
-from calib_planner.io import typical
 
 CASES: dict[str, Callable[[], LinearProblem]] = {
     "one target": lambda: problem_of(14, 1),

@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 import yaml
 
-from calib_planner.error_model import ErrorModel, Gravity, Mass, Placement, from_mapping, to_mapping
+from calib_planner.error_model import (
+    ErrorModel,
+    Gravity,
+    Mass,
+    Placement,
+    Prior,
+    from_mapping,
+    to_mapping,
+    typical,
+)
 from calib_planner.errors import InputError
-from calib_planner.io import typical
 from calib_planner.tracker import Isotropic, LaserTracker
 
 MODELS = {
@@ -21,7 +29,7 @@ MODELS = {
     "masses": lambda: typical(
         Isotropic(1e-5),
         gravity=Gravity((Mass("arm", 2, (0.1, 0.0, 0.2), 0.5), Mass("payload")), (0.0, 1.0, 0.0)),
-        placement=Placement(stated=(("d1", 1e-4),)),
+        placement=Placement(stated=Prior(("d1",), [0.5], [1e-4])),
         estimate_scale=True,
     ),
     "without": lambda: typical().without("short").without("gravity").with_values({"floor": 1.5e-5}, "estimated"),
@@ -72,3 +80,10 @@ def test_what_is_wrong_is_named(path: str, value: object, named: str) -> None:
     spoil(data, path, value)
     with pytest.raises(InputError, match=named):
         from_mapping(data)
+
+
+def test_the_file_to_begin_from_is_the_typical_model() -> None:
+    from calib_planner.io import read_error_model
+    from calib_planner.io.robots import config_folder
+
+    assert read_error_model(config_folder() / "error_models" / "typical.yaml") == typical()

@@ -10,13 +10,23 @@ from robots import mixed, random_configurations
 from scipy.integrate import quad
 
 from calib_planner import Robot
-from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points, Poses, Visits
+from calib_planner.error_model import (
+    ErrorModel,
+    Gravity,
+    JointFunctions,
+    Mass,
+    Placement,
+    Points,
+    Poses,
+    Prior,
+    Visits,
+    typical,
+)
 from calib_planner.error_model.gravity import downwards
 from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.io import typical
 from calib_planner.tracker import Isotropic, LaserTracker
 
 ROBOTS = {
@@ -65,7 +75,7 @@ def test_placement_columns_are_the_jacobian_and_priors_go_by_kind(robot: Robot) 
             assert std[parameter.name] == pytest.approx(4e-4 if parameter.unit == "m" else 2e-3)
     assert np.isinf(Placement("flat").variances(robot, {})).all()
     name = robot.parameter_names[7]
-    stated = Placement(stated=((name, 3e-5),)).variances(robot, values)
+    stated = Placement(stated=Prior((name,), [0.0], [3e-5])).variances(robot, values)
     assert (
         stated[7] == pytest.approx(9e-10) and np.isfinite(stated).sum() >= np.isfinite(list(std.values())).sum()
     )

@@ -13,10 +13,10 @@ from robots import SHARED_DATA, random_configurations
 
 from calib_planner import Estimate, IdentificationProblem, Measurements, Robot, identify, validate
 from calib_planner.compensation import compensate
-from calib_planner.error_model import ErrorModel, Knowledge
+from calib_planner.error_model import ErrorModel, Knowledge, Prior, typical
 from calib_planner.errors import InputError, NotEnoughDataError
-from calib_planner.identification import Prior, cross_validate
-from calib_planner.io import read_error_model, read_estimate, read_measurements, typical, write_estimate
+from calib_planner.identification import cross_validate
+from calib_planner.io import read_error_model, read_estimate, read_measurements, write_estimate
 from calib_planner.io.yaml import read_document, write_document
 
 PLAIN = {"discrepancy": "off", "joint_corrections": "off", "order_check": "off", "starts": 0}

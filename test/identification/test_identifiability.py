@@ -11,8 +11,9 @@ from cells import SIGMA, bare
 from robots import CASES, mixed, random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
+from calib_planner.error_model import Prior
 from calib_planner.errors import CalibPlannerError
-from calib_planner.identification import Prior, typical_prior
+from calib_planner.identification import typical_prior
 from calib_planner.robot import analyse, describe, is_nuisance
 from calib_planner.simulation import SimulatedCell, random_deviations
 

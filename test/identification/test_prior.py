@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from calib_planner import IdentificationProblem, InputError, Robot, UnknownNameError, identify
-from calib_planner.identification import Prior, typical_prior
+from calib_planner.error_model import Prior
+from calib_planner.identification import typical_prior
 from calib_planner.identification.problem import ANGLE_STD, LENGTH_STD, OFFSET_STD
 from calib_planner.robot import is_nuisance
 from calib_planner.simulation import SimulatedCell, random_deviations

@@ -11,9 +11,8 @@ from cells import POSE, ROUND, SIGMA, WrongRobot, bare, placed_cell, plain_cell,
 from robots import random_configurations
 
 from calib_planner import IdentificationProblem, Robot, identify, validate
-from calib_planner.error_model import ErrorModel
+from calib_planner.error_model import ErrorModel, typical
 from calib_planner.identification import LEVELS, RULES, cross_validate, judged
-from calib_planner.io import typical
 from calib_planner.measurements import RejectedPoint
 from calib_planner.simulation import SimulatedCell, random_deviations
 

@@ -26,7 +26,8 @@ from calib_planner import (
     identify,
     plan,
 )
-from calib_planner.identification import JointCorrections, Prior, cross_validate, validate
+from calib_planner.error_model import Prior
+from calib_planner.identification import JointCorrections, cross_validate, validate
 from calib_planner.identification.transmission import Transmission
 from calib_planner.io import read_estimate, read_plan, write_estimate, write_plan
 from calib_planner.io.plan import FINITE as FINITE_ARRAYS
