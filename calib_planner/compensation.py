@@ -17,12 +17,13 @@ reflector says where a point of the tool is, never how the tool is turned about 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, check_configurations, check_number, frozen
+from calib_planner.error_model import Knowledge
 from calib_planner.errors import InputError
 from calib_planner.robot import Goals, Robot, goals_of, residuals, solve
 
@@ -47,18 +48,6 @@ STATUS = {
     "outside_limits": "The nominal target lies outside the joint limits; the correction goes no further out.",
 }
 """Every status a row can have, with advice."""
-
-
-class Corrections(Protocol):
-    """Errors of the joints: ``JointCorrections``, or the ``Knowledge`` of an error model."""
-
-    def actual(self, q: ArrayLike, /) -> FloatArray:
-        """(N, joints) where the joints are when they read ``q`` [rad | m]."""
-        ...
-
-    def reading(self, actual: ArrayLike, /) -> FloatArray:
-        """(N, joints) what the joints read when they are at ``actual`` [rad | m]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +103,7 @@ def compensate(
     target: int = 0,
     limits: bool = True,
     lever: float = LEVER,
-    corrections: Corrections | None = None,
+    corrections: Knowledge | None = None,
 ) -> Compensation:
     """Correct joint targets for the difference between the two robots.
 

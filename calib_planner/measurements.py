@@ -7,9 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from calib_planner.arrays import FloatArray, check_array, check_configurations
+from calib_planner.arrays import FloatArray, IntArray, check_array, check_configurations
 from calib_planner.errors import InputError
+
+SAME_JOINT = 2e-4
+"""Joint values closer than this belong to visits of one configuration [rad | m]."""
 
 
 @dataclass(frozen=True)
@@ -108,3 +114,12 @@ class Measurements:
             raise InputError("joint names", ", ".join(self.joint_names), f"the robot's: {', '.join(joint_names)}")
         order = [self.joint_names.index(n) for n in joint_names]
         return Measurements(tuple(joint_names), self.q[:, order], self.p, self.std)
+
+
+def configuration_labels(q: FloatArray) -> IntArray:
+    """(N,) number of the configuration of each row of ``q`` (N, joints); repetitions share it."""
+    pairs = cKDTree(q).query_pairs(SAME_JOINT, p=np.inf, output_type="ndarray")
+    if not len(pairs):
+        return np.arange(len(q))
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(q), len(q)))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)

@@ -1,67 +1,27 @@
-"""What the measurements of a campaign say: is the scatter noise, which averages out, or the robot?
+"""What the measurements of a campaign say: how large the error at the test poses is, and what of it will stay.
 
-The instrument's σ is a statement. Residuals larger than it explains are either more noise than stated, or a model
-discrepancy D, which no number of measurements reduces. The difference decides whether to go on or to stop, and
-only repetitions can tell: with SS_r the sum of squares of repetitions about their configurations' means, ν_r
-degrees of freedom, and SS, ν those of all residuals, the lack of fit
-
-    F = ((SS − SS_r)/(ν − ν_r)) / (SS_r/ν_r)
-
-is Fisher's F(ν − ν_r, ν_r) if all is noise. So there are four answers:
-
-    as_stated     the residuals are what the instrument says
-    noise         they are more (or far less), and repetitions scatter as much: σ is scaled to what they say
-    discrepancy   F is improbable, or the joints' errors were learnt: the rest is the robot's
-    open          they are more, and there are not ``ENOUGH`` repetitions to tell: measure some again
-
-While the answer is ``open``, the accuracy is the worse one, that with the discrepancy.
+The error of a visit to a test pose has two parts. What is not known of the robot, (M3), falls with the
+measurements. What is new at each visit, the robot's *repeatability*, stays: it is the *floor*. Both are the error
+model's, with the sizes that the measurements tell.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray
 from calib_planner.campaign.problem import CampaignProblem, Round
 from calib_planner.campaign.state import FIT, CampaignState
-from calib_planner.identification import (
-    DOUBT,
-    FEWEST_SPARE,
-    Estimate,
-    IdentificationProblem,
-    configuration_labels,
-    identify,
-    improbable,
-)
-from calib_planner.measurements import Measurements
-from calib_planner.planning import ModelDiscrepancy
+from calib_planner.identification import Estimate, IdentificationProblem, identify
+from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.tracker import Isotropic, Noise
 from calib_planner.units import cut, length
 
-ENOUGH = 30
-"""Degrees of freedom of repetitions that tell noise from discrepancy: a ratio of variances of 3 is then seen."""
-AS_STATED, NOISE, DISCREPANCY, OPEN = "as_stated", "noise", "discrepancy", "open"
-
-
-@dataclass(frozen=True)
-class Scaled:
-    """An instrument whose standard deviations are ``factor`` times as large."""
-
-    noise: Noise
-    factor: float
-
-    def covariance(self, points: NDArray[Any]) -> NDArray[Any]:
-        """As of every ``Noise``."""
-        return self.factor**2 * self.noise.covariance(points)
-
-    @property
-    def typical(self) -> float:
-        """As of every ``Noise`` [m]."""
-        return self.factor * self.noise.typical
+FEWEST_SPARE = 10
+"""Equations beyond the parameters from which an estimate can be judged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,32 +31,30 @@ class Assessment:
     Attributes:
         problem: What was identified.
         estimate: Its answer.
-        scatter: One of the four answers.
-        noise: The instrument as the measurements show it.
     """
 
     problem: IdentificationProblem
     estimate: Estimate
-    scatter: str
-    noise: Noise
+
+    @cached_property
+    def floor_per_test_pose(self) -> FloatArray:
+        """(K,) repeatability there, root mean square distance over the targets [m]; it stays."""
+        told = self.estimate.knowledge.predict(self.estimate.accuracy.test_poses)
+        return np.asarray(np.sqrt(np.einsum("ktii->kt", told.repeatability).mean(axis=1)))
+
+    @property
+    def accuracy_per_test_pose(self) -> FloatArray:
+        """(K,) error of a visit: what is not known of the robot, and its repeatability [m]."""
+        return np.hypot(self.estimate.accuracy.predicted, self.floor_per_test_pose)
 
     @property
     def accuracy(self) -> float:
-        """Error predicted at the worst test pose [m]; infinite where the data are blind."""
-        return float(np.max(self.estimate.accuracy.predicted))
-
-    @property
-    def floor_per_test_pose(self) -> FloatArray:
-        """(K,) what more measurements leave of it, root mean square distance [m]."""
-        learnt = self.estimate.transmission
-        if learnt is None:
-            return self.estimate.accuracy.discrepancy
-        left = learnt.remainder(self.estimate.accuracy.test_poses)
-        return np.asarray(np.sqrt(np.einsum("ktii->kt", left).mean(axis=1)))
+        """The same at the worst test pose [m]; infinite where the data are blind."""
+        return float(np.max(self.accuracy_per_test_pose))
 
     @property
     def floor(self) -> float:
-        """The same at the worst test pose [m]."""
+        """``floor_per_test_pose`` at the worst test pose [m]."""
         return float(np.max(self.floor_per_test_pose))
 
     @property
@@ -106,21 +64,15 @@ class Assessment:
         return self.floor * float(np.sqrt(max(1.0 - 2.0 * np.sqrt(2.0 / freedom), 0.0)))
 
     @property
+    def noise(self) -> Noise:
+        """Noise of a point, as the measurements show it."""
+        return Isotropic(self.estimate.noise.sigma)
+
+    @property
     def used(self) -> Measurements:
         """The measurements that were not rejected."""
         data = self.problem.data.without(self.estimate.points.rejected)
         return data.select(np.flatnonzero(data.seen.any(axis=1)))
-
-    @property
-    def discrepancy(self) -> ModelDiscrepancy | None:
-        """The discrepancy to plan with, or ``None``."""
-        if self.scatter != DISCREPANCY:
-            return None
-        learnt, usual = self.estimate.transmission, self.estimate.noise.for_planning()
-        if learnt is None:
-            return usual
-        own = {"joint_sigma": learnt.amplitude, "joint_length": learnt.length, "point_sigma": learnt.point}
-        return replace(usual, **own)
 
 
 def assess(state: CampaignState) -> Assessment | None:
@@ -133,49 +85,25 @@ def assess(state: CampaignState) -> Assessment | None:
     data = state.data(FIT)
     if data is None:
         return None
-    question = _question(state.problem, data, state.problem.instrument)
-    estimate = identify(question)
-    noise, chi = estimate.noise, estimate.residuals.chi_square
-    stated = Scaled(state.problem.instrument, noise.scaled) if noise.scaled > 1 else state.problem.instrument
-    if estimate.transmission is not None or _lack_of_fit(estimate):
-        return Assessment(question, estimate, DISCREPANCY, stated)
-    if noise.discrepancy > 0 and noise.repeat_freedom < ENOUGH:
-        return Assessment(question, estimate, OPEN, stated)
-    too_small = chi.freedom >= FEWEST_SPARE and chi.probability > 1.0 - DOUBT
-    if noise.discrepancy > 0 or noise.scaled > 1 or too_small:
-        # All of the scatter is taken as noise.
-        factor = noise.scaled * float(np.sqrt(max(chi.value / max(chi.freedom, 1), 1e-12)))
-        rescaled = Scaled(state.problem.instrument, factor)
-        question = _question(state.problem, data, rescaled)
-        return Assessment(question, identify(question), NOISE, rescaled)
-    return Assessment(question, estimate, AS_STATED, stated)
+    problem = identification_problem(state.problem, data)
+    return Assessment(problem, identify(problem))
 
 
-def _lack_of_fit(estimate: Estimate) -> bool:
-    """Whether the residuals are more than repetitions explain; see the module."""
-    levels, chi = estimate.noise, estimate.residuals.chi_square
-    if not levels.repeat_freedom or not levels.repeatability > 0 or levels.discrepancy <= 0:
-        return False
-    in_units_of_repetitions = chi.value * (levels.measurement / levels.repeatability) ** 2
-    return improbable(in_units_of_repetitions, chi.freedom, levels.repeat_freedom)
-
-
-def _question(problem: CampaignProblem, data: Measurements, noise: Noise) -> IdentificationProblem:
-    alike = isinstance(noise, Isotropic)
+def identification_problem(problem: CampaignProblem, data: Measurements) -> IdentificationProblem:
+    """What is identified from ``data``; their own standard deviations go before the instrument's."""
+    instrument = None if data.std is not None else problem.instrument
+    alike = isinstance(instrument, Isotropic)
     return IdentificationProblem(
         problem.robot,
-        Measurements(data.joint_names, data.q, data.p),
-        sigma=noise.typical if alike else None,
-        instrument=None if alike else noise,
+        data,
+        sigma=instrument.typical if instrument is not None and alike else None,
+        instrument=None if alike else instrument,
         test_poses=problem.test_pose_array,
         **problem.identification,
     )
 
 
 # ── Is it enough to judge by, enough altogether, or never enough? ────────────────────────────────────────────
-
-LEARNABLE = 24
-"""Configurations from which on errors of the joints that could be learnt would have been."""
 
 
 def outcome_of(state: CampaignState, known: Assessment | None) -> tuple[str, str]:
@@ -204,10 +132,7 @@ def ready(state: CampaignState, known: Assessment) -> bool:
 
 def limited(state: CampaignState, known: Assessment) -> bool:
     """Whether no number of measurements would do."""
-    if known.scatter != DISCREPANCY or known.surely <= state.problem.required_accuracy:
-        return False
-    may_learn = state.problem.identification.get("joint_corrections", "auto") == "auto"
-    return not may_learn or len(different(known.used)) >= LEARNABLE
+    return known.surely > state.problem.required_accuracy
 
 
 def different(data: Measurements) -> Measurements:
@@ -217,8 +142,7 @@ def different(data: Measurements) -> Measurements:
 
 def forecast(known: Assessment, required: float) -> float:
     """Measurements still needed; infinite where the floor is above what is required."""
-    floor = known.floor_per_test_pose
-    total = known.estimate.accuracy.predicted
+    floor, total = known.floor_per_test_pose, known.accuracy_per_test_pose
     room = required**2 - floor**2
     if not np.isfinite(total).all() or (room <= 0).any():
         return float("inf")
@@ -236,7 +160,7 @@ def round_of(state: CampaignState, known: Assessment | None, planned: int, note:
     number = len(state.rounds)
     if known is None:
         nan = float("nan")
-        return Round(number, 0, 0, float("inf"), nan, nan, "", nan, planned, note)
+        return Round(number, 0, 0, float("inf"), nan, nan, nan, planned, note)
     return Round(
         number,
         len(known.used),
@@ -244,7 +168,6 @@ def round_of(state: CampaignState, known: Assessment | None, planned: int, note:
         known.accuracy,
         known.floor,
         known.noise.typical,
-        known.scatter,
         forecast(known, state.problem.required_accuracy),
         planned,
         note,

@@ -2,17 +2,15 @@
 
 For the fit, in this order:
 
-1. The error predicted at the worst test pose, with noise and discrepancy *as estimated*, is what was required,
+1. The error predicted of a visit to the worst test pose, see ``assess``, is what was required,
    there are ``minimum`` configurations, and different ones give ``FEWEST_SPARE`` more equations than there are
    parameters (repetitions cannot show that the model is wrong): **reached**.
 2. More than ``most_failures`` configurations had to be given up: **unreachable**.
 3. No measurement is left but those of the validation: **budget_spent**.
-4. What repetitions prove to be the robot's own, not noise, is more than required at a test pose even if nothing
-   else were uncertain: **limited**. More measurements cannot help. Errors of the joints can be learnt, though, so
-   where that is allowed this waits for ``LEARNABLE`` configurations.
-5. If it is open whether the scatter is noise, measured configurations are measured again: repetitions decide it.
-6. Else the next batch is planned on the robot as identified so far, with the noise as estimated and all that was
-   measured; for a robot with a discrepancy (see ``planning.ModelDiscrepancy``) from random candidates.
+4. The robot's repeatability is surely more than required at a test pose even if nothing else were uncertain:
+   **limited**. More measurements cannot help.
+5. Else the next batch is planned on the robot as identified so far, with the noise as estimated and all that was
+   measured.
 
 Then the validation. Good plans measure at few places, where a wrong model fits well enough; configurations that
 were chosen to lie elsewhere contradict it best. If they do (χ², see ``finish``) although the accuracy seemed to
@@ -35,7 +33,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_planner.campaign.assess import (
-    OPEN,
+    FEWEST_SPARE,
     Assessment,
     assess,
     different,
@@ -47,10 +45,7 @@ from calib_planner.campaign.assess import (
 from calib_planner.campaign.finish import ended, toured, validation
 from calib_planner.campaign.state import FIT, VALIDATION, CampaignState, NextStep, PlannedConfiguration
 from calib_planner.errors import CalibPlannerError, InfeasibleError, NotEnoughDataError
-from calib_planner.identification import FEWEST_SPARE
 from calib_planner.planning import (
-    Candidates,
-    Feasibility,
     PlanPrior,
     PlanProblem,
     Search,
@@ -61,8 +56,6 @@ from calib_planner.planning import (
 
 REPEATED = 4
 """Configurations of the first batch measured twice: 12 degrees of freedom for the noise of one target."""
-CANDIDATES = 500
-"""Candidates for a plan with discrepancy."""
 
 
 def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) -> NextStep:
@@ -100,15 +93,9 @@ def decide(state: CampaignState, stopped: Callable[[], bool] = lambda: False) ->
 def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable[[], bool]) -> NextStep:
     problem = state.problem
     allowed = problem.fit_budget - state.spent(FIT)
-    if known is not None and known.scatter == OPEN and (again := _to_repeat(state, min(problem.batch, allowed))):
-        text = "more scatter than the instrument's: measuring again tells whether it is noise or the robot"
-        queue = toured(state, np.array([state.configurations[i].q for i in again]), again)
-        times = tuple((i, 1) for i in again)
-        return NextStep(FIT, text, again=times, queue=queue, round=round_of(state, known, len(again), text),
-                        left=_left(state, known))  # fmt: skip
     request = plan_problem(state, known)
     size, repeated = _size(state, known, request, allowed)
-    made = plan(_sized(request, size, state, known), lambda progress: stopped())
+    made = plan(replace(request, configurations=size), lambda progress: stopped())
     q = made.configurations
     first = len(state.configurations)
     queue = toured(state, q, tuple(range(first, first + len(q))))
@@ -163,25 +150,6 @@ def _size(state: CampaignState, known: Assessment | None, request: PlanProblem, 
         text = f"{allowed} measurements are left for the fit, {size} at least are needed to judge it: raise it"
         raise InfeasibleError("budget", text)
     return size, REPEATED if known is None else 0
-
-
-def _sized(request: PlanProblem, size: int, state: CampaignState, known: Assessment | None) -> PlanProblem:
-    """The request for ``size`` configurations, from candidates where the robot has a discrepancy."""
-    discrepancy = None if known is None else known.discrepancy
-    if discrepancy is None:
-        return replace(request, configurations=size)
-    rng = np.random.default_rng([state.problem.seed, len(state.rounds), 3])
-    q = Feasibility(request.robot, request.constraints).sample(rng, CANDIDATES)
-    return replace(
-        request, configurations=size, criterion="test_pose", candidates=Candidates(q), discrepancy=discrepancy
-    )
-
-
-def _to_repeat(state: CampaignState, count: int) -> tuple[int, ...]:
-    """Stops to measure again: those measured fewest times, first those measured last."""
-    rows = state.measurements_of(FIT)
-    times = {i: sum(r.index == i for r in rows) for i in {r.index for r in rows} - set(state.dropped)}
-    return tuple(sorted(times, key=lambda i: (times[i], -i))[:count])
 
 
 def _spread(queue: tuple[int, ...], count: int) -> tuple[int, ...]:

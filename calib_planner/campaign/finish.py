@@ -25,8 +25,6 @@ from calib_planner.campaign.problem import OUTCOMES, CampaignResult, distances
 from calib_planner.campaign.state import FINISHED, FIT, VALIDATION, CampaignState, NextStep, PlannedConfiguration
 from calib_planner.errors import CalibPlannerError, InfeasibleError
 from calib_planner.identification import (
-    DOUBT,
-    SAME_JOINT,
     Estimate,
     Reason,
     Rule,
@@ -35,15 +33,16 @@ from calib_planner.identification import (
     validate,
     without_noise,
 )
-from calib_planner.measurements import Measurements
+from calib_planner.measurements import SAME_JOINT, Measurements
 from calib_planner.planning import Feasibility, visiting_order
-from calib_planner.tracker import Noise
 from calib_planner.units import counted, length
 
 NEAR = 0.1
 """Half width of the neighbourhood of a test pose, as a share of each joint's range."""
 APART = 0.02
 """Least distance from what was measured, as a share of the joints' ranges; a test pose keeps to it, too."""
+DOUBT = 1e-3
+"""Held-out measurements less probable than this contradict the estimate."""
 DRAWN = 600
 """Configurations to choose from, near and anywhere."""
 
@@ -93,7 +92,7 @@ def validation(state: CampaignState, known: Assessment | None = None) -> NextSte
             planned = tuple(PlannedConfiguration(row, VALIDATION) for row in q)
             return NextStep(VALIDATION, state.message, planned, (), queue, left=state.left)
     held_out = state.data(VALIDATION)
-    if held_out is not None and contradicted(known.estimate, known.noise, held_out):
+    if held_out is not None and contradicted(known.estimate, held_out):
         if state.outcome == "reached" and problem.budget - state.spent() > problem.validation:
             text = "the validation contradicts what was predicted: its measurements join the fit, which goes on"
             return NextStep(FIT, text, joins=True)
@@ -219,18 +218,10 @@ def campaign_verdict(estimate: Estimate, required: float, at_test_poses: Measure
     return Verdict.of(reasons)
 
 
-def contradicted(estimate: Estimate, noise: Noise, held_out: Measurements) -> bool:
+def contradicted(estimate: Estimate, held_out: Measurements) -> bool:
     """Whether held-out measurements are improbably far from the predictions, given their covariance."""
-    q, seen = held_out.q, held_out.seen
-    if estimate.transmission is not None:
-        covariance = estimate.transmission.error_covariance(q)
-    else:
-        robot = estimate.calibrated
-        columns = np.ascontiguousarray(robot.jacobian(q)).reshape(*held_out.p.shape, -1)
-        covariance = columns @ estimate.fit.covariance @ np.swapaxes(columns, 2, 3)
-        covariance = covariance + estimate.noise.discrepancy_covariance(robot, q)
-    predicted = estimate.positions(q)
-    distance = normalised(held_out.p - predicted, covariance + noise.covariance(predicted))[seen]
+    told, seen = estimate.knowledge.predict(held_out.q), held_out.seen
+    distance = normalised(held_out.p - told.mean, told.total)[seen]
     return float(chdtrc(3 * len(distance), np.sum(distance**2))) < DOUBT
 
 
@@ -244,7 +235,7 @@ def _predicted(estimate: Estimate, required: float) -> Reason:
 def _achieved(estimate: Estimate, required: float, data: Measurements) -> Reason:
     residuals = (data.p - estimate.positions(data.q))[data.seen]
     square = float(np.mean(np.sum(residuals**2, axis=1)))
-    noise = 3.0 * estimate.noise.measurement**2
+    noise = 3.0 * estimate.noise.sigma**2
     return RULES["achieved_at_test_poses"].reason(
         "PASS" if without_noise(square, noise, len(residuals)) <= required else "FAIL",
         points=counted(len(residuals), "point"),

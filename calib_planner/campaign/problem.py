@@ -28,7 +28,7 @@ from calib_planner.planning import Constraint, PlanProblem, Search
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
 
-OPTIONS = ("loss", "prior", "discrepancy", "joint_corrections", "iterations", "starts")
+OPTIONS = ("loss", "prior", "error_model")
 """Fields of ``IdentificationProblem`` that a campaign may set; it sets the others itself."""
 COUNTS = {
     "budget": (1, 10_000),
@@ -234,10 +234,9 @@ class Round:
         number: From 0; round 0 has nothing measured.
         measured: Measurements used.
         configurations: Different ones among them.
-        accuracy: Error predicted at the worst test pose, noise and discrepancy as estimated [m].
-        floor: What more measurements leave of it [m].
+        accuracy: Error predicted of a visit to the worst test pose [m].
+        floor: What more measurements leave of it, the robot's repeatability [m].
         sigma: Noise of one coordinate of one measurement, as estimated [m].
-        scatter: What the residuals are, see ``scatter``.
         left: Forecast of measurements still needed; infinite: it cannot be reached.
         planned: Measurements planned next.
         note: What was decided, in words.
@@ -249,7 +248,6 @@ class Round:
     accuracy: float
     floor: float
     sigma: float
-    scatter: str
     left: float
     planned: int
     note: str

@@ -35,8 +35,7 @@ from calib_planner.campaign.problem import (
     radius_of,
 )
 from calib_planner.errors import InputError
-from calib_planner.identification import configuration_labels
-from calib_planner.measurements import Measurements
+from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.planning import Constraint
 
 FIT, VALIDATION, FINISHED = "fit", "validation", "finished"

@@ -109,11 +109,6 @@ def add_test_path(parser: Group) -> None:
     option(parser, "--test-path", "FILE", "CSV with a column per joint; every row is a test pose")
 
 
-def add_joint_corrections(group: Group, choices: Sequence[str]) -> None:
-    text = "auto: errors of the joints' transmissions are learnt where the data show them; off: never"
-    option(group, "--joint-corrections", None, text, "auto", choices=choices)
-
-
 def numbers(text: str) -> list[float]:
     """Numbers separated by spaces or commas."""
     try:

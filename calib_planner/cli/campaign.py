@@ -29,7 +29,6 @@ from calib_planner.cli.arguments import (
     Commands,
     add_command,
     add_conditions,
-    add_joint_corrections,
     add_parameters,
     add_robot,
     add_seed,
@@ -44,9 +43,9 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.errors import InputError
-from calib_planner.identification import AUTOMATIC
 from calib_planner.io import (
     make_folder,
+    read_error_model,
     read_measurements,
     write_configurations,
     write_estimate,
@@ -90,7 +89,8 @@ def add(commands: Commands, summary: str) -> None:
     for name, text in NUMBERS.items():
         option(work, f"--{name}", "N", text, DEFAULTS[name])
     add_conditions(work)
-    add_joint_corrections(work, AUTOMATIC)
+    text = "how the robot errs, for the identification: typical, paper (noise alone), or YAML, also an estimate"
+    option(work, "--error-model", "E", text, "typical")
     hand = parser.add_argument_group("by hand")
     option(hand, "--measured", "FILE", "CSV of what was measured for the fit so far")
     option(hand, "--held-out", "FILE", "CSV of what was measured for validation")
@@ -138,7 +138,7 @@ def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
         **{name: getattr(args, name) for name in NUMBERS},
         sigma=args.sigma,
         **conditions(args, robot),
-        identification={"joint_corrections": args.joint_corrections},
+        identification={"error_model": read_error_model(args.error_model)},
         starts=args.starts,
         seed=args.seed,
     )
@@ -235,13 +235,6 @@ def _write(folder: Path, result: CampaignResult) -> None:
 # ── a campaign for people: its verdict and outcome first, then how it went ─────────────────────────────────
 
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
-SCATTER = {
-    "": "",
-    "as_stated": "as stated",
-    "noise": "noise, as repeated",
-    "discrepancy": "the robot's own",
-    "open": "open: more than stated",
-}
 
 
 def show_result(result: CampaignResult, achieved: FloatArray | None, console: Console) -> None:
@@ -273,12 +266,11 @@ def rounds_table(rounds: Sequence[Round]) -> Table:
     table = Table(title="rounds")
     for heading in ("#", "measured", "different", "predicted", "σ", "still needed", "planned"):
         table.add_column(heading, justify="right")
-    table.add_column("scatter")
     for r in rounds:
         known = np.isfinite(r.sigma)
         cells = [str(r.measured), str(r.configurations), length(r.accuracy) if known else "–"]
         cells += [length(r.sigma) if known else "–", _left(r.left), str(r.planned)]
-        table.add_row(str(r.number), *cells, SCATTER[r.scatter])
+        table.add_row(str(r.number), *cells)
     return table
 
 

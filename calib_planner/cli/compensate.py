@@ -21,7 +21,7 @@ from calib_planner.cli.arguments import (
     switch,
 )
 from calib_planner.cli.terminal import Terminal
-from calib_planner.compensation import STATUS, Compensation, Corrections, compensate
+from calib_planner.compensation import STATUS, Compensation, compensate
 from calib_planner.errors import InputError
 from calib_planner.io import calibrated_robot, format_table, read_configurations, read_estimate, write_text
 from calib_planner.robot import Robot
@@ -34,8 +34,7 @@ DESCRIPTION = """Correct joint targets so that the real tool goes where the nomi
 The CSV of targets has a column per joint [rad | m], in any order. What is written has the same rows: the
 corrected joints [rad | m], what remains (position_error [m], rotation_error [rad]), and reached: 1, or 0 where
 the row could not be reached exactly and is the closest there is. Joint limits are respected. Where the base
-stands before the tracker plays no part. Joint corrections, or the gravity and joint functions of an error model,
-that the estimate holds are applied."""
+stands before the tracker plays no part. Gravity and joint functions that the estimate holds are applied."""
 
 ERRORS = ("position_error", "rotation_error", "reached")
 
@@ -50,7 +49,7 @@ def add(commands: Commands, summary: str) -> None:
     switch(what, "--position-only", "only the position of a point counts, not how the tool is turned")
     text = "that point, in the frame of the last link [m] (the first reflector, as identified)"
     option(what, "--tool", '"x y z"', text, kind=numbers)
-    text = "leave out the errors of the joints that the estimate may hold: what a calibrated URDF does"
+    text = "placement alone, without gravity and joint functions: what a calibrated URDF does"
     switch(what, "--geometry-only", text)
     switch(what, "--ignore-limits", "joint limits do not matter")
     add_seed(parser)
@@ -60,16 +59,11 @@ def add(commands: Commands, summary: str) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     nominal = load_robot(args)
     saved = read_estimate(args.estimate)
-    corrections, learnt = saved.joint_corrections, saved.learnt
-    calibrated: Robot = calibrated_robot(nominal, saved)
-    errors: Corrections | None = None
-    if not args.geometry_only and learnt is not None:
-        calibrated, errors = saved.calibrated(nominal), saved.knowledge(nominal)
-    elif not args.geometry_only and corrections is not None:
-        calibrated, errors = saved.complete(nominal), corrections.corrections
-    if args.position_only and args.tool is None and saved.targets is not None:
+    errors = None if args.geometry_only or saved.learnt is None else saved.knowledge(nominal)
+    calibrated = calibrated_robot(nominal, saved) if errors is None else errors.placed
+    if args.position_only and args.tool is None:
         # The same point of the tool on both robots: a nominal place of a reflector is no more than a guess.
-        nominal, calibrated = nominal.with_targets(saved.targets), calibrated.with_targets(saved.targets)
+        nominal = nominal.with_targets(calibrated.target_offsets)
     if args.tool is not None:
         nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
     q = read_configurations(args.joint_targets, nominal, degrees=args.degrees)
@@ -90,8 +84,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         "robot": nominal.name,
         **result.to_dict(),
         "position_only": args.position_only,
-        "joint_corrections": errors is not None and learnt is None,
-        **({} if learnt is None else {"error_model": errors is not None}),
+        "error_model": errors is not None,
         "output": args.output,
     }
     if args.json:

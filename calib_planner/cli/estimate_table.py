@@ -13,10 +13,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from calib_planner.identification import Estimate, Learnt, NoiseLevels, Validation
+from calib_planner.identification import Estimate, LeftOutError, Reason, Validation
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import is_nuisance
-from calib_planner.units import length, milli, milliradians, signed
+from calib_planner.units import counted, length, milli, signed
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}
@@ -29,7 +29,6 @@ SOURCES = {
     "sigma": "as given",
     "instrument": "by the instrument",
     "data": "by the files' std",
-    "repetitions": "from repetitions",
     "residuals": "from the residuals",
 }
 MEANINGS = {
@@ -42,6 +41,8 @@ MEANINGS = {
 }
 """Term of the error model → what it means."""
 HEADINGS = ("count", "mean before", "mean after", "median", "rms", "max", "rms predicted", "in 95 %")
+MOST_REASONS = 3
+"""A first screen that people read."""
 MOST_POINTS = 10
 MOST_COMBINATIONS = 8
 MOST_POSES = 6
@@ -52,8 +53,7 @@ def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], s
     _show_verdict(estimate, console)
     console.print(_distances(estimate))
     console.print(_noise(estimate), soft_wrap=True)
-    if estimate.error_model is not None:
-        console.print(_terms(estimate.error_model))
+    console.print(_terms(estimate))
     if len(estimate.accuracy.test_poses):
         console.print(_accuracy(estimate), soft_wrap=True)
     console.print(_counts(estimate), soft_wrap=True)
@@ -67,21 +67,39 @@ def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], s
     _show_list(console, "Hardly seen by the data, weakest first:", estimate.observability.nearly_dependent)
     _show_points(console, "Rejected", estimate.points.rejected, where)
     _show_points(console, "Used, but far off", estimate.points.suspects, where)
+    _show_remarks(estimate, console)
 
 
 # ── is it good? ──────────────────────────────────────────────────────────────────────────────────────
 
 
 def _show_verdict(estimate: Estimate, console: Console) -> None:
+    """The level and its ``MOST_REASONS`` most important reasons; the rest stands at the end."""
     verdict = estimate.verdict
     console.print(WORDS[verdict.level], style=STYLES[verdict.level])
-    for reason in verdict.reasons:
-        label = "note" if reason.level == "PASS" else reason.level
-        text = Text(f"{label}  ", style="dim" if reason.level == "PASS" else STYLES[reason.level])
-        text.append(reason.text, style="not dim not bold default")
-        if reason.advice:
-            text.append(f" → {reason.advice}", style="not bold italic default")
-        console.print(Padding(text, (0, 0, 0, 2)))
+    for reason in verdict.reasons[:MOST_REASONS]:
+        console.print(Padding(_reason(reason), (0, 0, 0, 2)))
+    more = len(verdict.reasons) - MOST_REASONS
+    if more > 0:
+        console.print(Padding(Text(f"{counted(more, 'more remark')} at the end", style="dim"), (0, 0, 0, 2)))
+
+
+def _show_remarks(estimate: Estimate, console: Console) -> None:
+    """The reasons that the first screen does not show."""
+    more = estimate.verdict.reasons[MOST_REASONS:]
+    if more:
+        console.print("Further remarks:")
+    for reason in more:
+        console.print(Padding(_reason(reason), (0, 0, 0, 2)))
+
+
+def _reason(reason: Reason) -> Text:
+    label = "note" if reason.level == "PASS" else reason.level
+    text = Text(f"{label}  ", style="dim" if reason.level == "PASS" else STYLES[reason.level])
+    text.append(reason.text, style="not dim not bold default")
+    if reason.advice:
+        text.append(f" → {reason.advice}", style="not bold italic default")
+    return text
 
 
 def _distances(estimate: Estimate) -> Table:
@@ -91,22 +109,24 @@ def _distances(estimate: Estimate) -> Table:
     for heading in HEADINGS:
         table.add_column(heading, justify="right")
     before, after = estimate.residuals.before, estimate.residuals.after
-    label = "fitted" if estimate.transmission is None else "fitted, geometry"
     cells = [milli(before.mean), milli(after.mean), "", milli(after.rms), milli(after.max)]
-    table.add_row(label, str(estimate.points.used), *cells)
-    if estimate.error_model is not None:
-        left = estimate.error_model.left_out
-        lengths = [milli(v) for v in (left.rms, left.max, left.predicted_rms)]
-        table.add_row("left out, visit by visit", str(left.count), "", milli(left.mean), "", *lengths, "")
-    for result in (estimate.cross_validation, estimate.validation):
-        if result is not None:
-            label = f"left out, {result.folds} folds" if result.folds else "held out"
-            table.add_row(label, str(result.count), *_held_out(result))
-            if estimate.transmission is not None or estimate.error_model is not None:
-                table.add_row(
-                    "… geometry alone", "", "", milli(result.geometry_mean), "", milli(result.geometry_rms)
-                )
+    table.add_row("fitted", str(estimate.points.used), *cells)
+    _add_left_out(table, "left out, visit by visit", estimate.left_out)
+    systematic = len(estimate.knowledge.model.systematic) > 1
+    if systematic:
+        _add_left_out(table, "… placement alone", estimate.placement_alone)
+    if estimate.validation is not None:
+        v = estimate.validation
+        table.add_row("held out", str(v.count), *_held_out(v))
+        if systematic:
+            cells = ["", milli(v.placement_mean), "", milli(v.placement_rms)]
+            table.add_row("… placement alone", "", *cells)
     return table
+
+
+def _add_left_out(table: Table, label: str, left: LeftOutError) -> None:
+    lengths = [milli(v) for v in (left.rms, left.max, left.predicted_rms)]
+    table.add_row(label, str(left.count), "", milli(left.mean), "", *lengths, "")
 
 
 def _held_out(v: Validation) -> list[str]:
@@ -115,12 +135,12 @@ def _held_out(v: Validation) -> list[str]:
     return [*(milli(v) for v in lengths), inside]
 
 
-def _terms(learnt: Learnt) -> Table:
+def _terms(estimate: Estimate) -> Table:
     """How large each term is at the measured points, and what it means."""
     table = Table(title="error model: what moves the measured points, rms [mm]")
     for heading in ("term", "size", "± std", "gain", "what it means"):
         table.add_column(heading, justify="left" if heading in ("term", "what it means") else "right")
-    for term in learnt.terms:
+    for term in estimate.terms:
         size = milli(term.size) if term.kept else "left out"
         std = milli(term.std) if np.isfinite(term.std) else ""
         gain = f"{term.gain:+.1f}" if np.isfinite(term.gain) else ""
@@ -130,43 +150,19 @@ def _terms(learnt: Learnt) -> Table:
 
 
 def _noise(estimate: Estimate) -> str:
-    """Measurement noise and what no geometric model holds, in one line."""
-    noise = estimate.noise
-    if not np.isfinite(noise.measurement):
-        return "Noise: unknown, nothing is redundant."
-    if estimate.error_model is not None:
-        return f"Noise per coordinate of a point: {length(noise.measurement)} ({SOURCES[noise.source]})."
-    scaled = f", raised {noise.scaled:.2g} times by repetitions" if noise.scaled > 1 else ""
-    text = f"Noise per coordinate: measurement {length(noise.measurement)} ({SOURCES[noise.source]}{scaled})"
-    if noise.repeat_freedom and noise.source != "repetitions":
-        text += f"; repetitions scatter {length(noise.repeatability)}"
-    return text + _discrepancy(noise) + "." + _corrections(estimate)
-
-
-def _corrections(estimate: Estimate) -> str:
-    """What was learnt beside the geometry."""
-    learnt = estimate.transmission
-    return "" if learnt is None else f" Joint corrections were learnt: {milliradians(learnt.amplitude)}."
-
-
-def _discrepancy(noise: NoiseLevels) -> str:
-    if not noise.discrepancy > 0:
-        return "; no model discrepancy"
-    parts = [f"{milliradians(noise.turning, 3)} in each turning joint"] if noise.turning else []
-    parts += [f"{length(noise.sliding)} in each sliding joint"] if noise.sliding else []
-    parts += [f"{length(noise.point)} in each point"] if noise.point else []
-    return f"; beyond any geometric model {length(noise.discrepancy)} ({', '.join(parts)})"
+    """Noise of a point, in one line."""
+    return f"Noise per coordinate of a point: {length(estimate.noise.sigma)} ({SOURCES[estimate.noise.source]})."
 
 
 def _accuracy(estimate: Estimate) -> str:
     per = estimate.accuracy.predicted
     shown = ", ".join(length(v) for v in per[:MOST_POSES]) + _more(len(per), MOST_POSES)
     text = f"Predicted error at the test pose{'s' if len(per) > 1 else ''}: {shown}"
-    own, rest = estimate.accuracy.parameters, estimate.accuracy.discrepancy
+    own, alone = estimate.accuracy.parameters, estimate.accuracy.placement
     if np.isfinite(own).all():
-        parts = [length(float(np.sqrt(np.mean(v**2)))) for v in (own, rest)]
-        text += f" (parameters, ρ0: {parts[0]}; beyond the model: {parts[1]})"
-    if estimate.error_model is not None and estimate.error_model.frame == "robot":
+        parts = [length(float(np.sqrt(np.mean(v**2)))) for v in (own, alone)]
+        text += f" (parameters: {parts[0]}; with placement alone: {parts[1]})"
+    if estimate.accuracy.frame == "robot":
         text += ", up to a new registration of the robot"
     required = estimate.accuracy.required
     return text + (f"; required: {length(required)}" if np.isfinite(required) else "")

@@ -17,7 +17,6 @@ from calib_planner.cli.arguments import (
     TYPICAL,
     Commands,
     add_command,
-    add_joint_corrections,
     add_parameters,
     add_robot,
     add_seed,
@@ -30,18 +29,13 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.estimate_table import show_estimate
 from calib_planner.cli.terminal import Terminal
-from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, NotEnoughDataError
+from calib_planner.error_model import ACCURACIES, Prior, with_tolerances
+from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
 from calib_planner.identification import (
-    ACCURACIES,
-    AUTOMATIC,
     LOSSES,
-    WITHOUT_MODEL,
     Estimate,
     IdentificationProblem,
-    Prior,
-    cross_validate,
     identify,
-    typical_prior,
     validate,
 )
 from calib_planner.io import (
@@ -65,9 +59,8 @@ from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
 
-EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \\
-      --unknown base,tool --prior typical --loss robust --folds 5 \\
-      --validate test.csv --validate-target-from 1 --output estimate.yaml"""
+EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \
+      --unknown base,tool --validate test.csv --validate-target-from 1 --output estimate.yaml"""
 
 DESCRIPTION = """Identify the robot's parameters from measured points.
 
@@ -96,7 +89,6 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     if args.validate_target_from and not args.validate:
         raise InputError("--validate-target-from", args.validate_target_from, "--validate FILE beside it")
     check_files(args)
-    check_error_model(args)
     robot = load_robot(args)
     check_outputs(args, robot)
     settings = source_settings(args, terminal)
@@ -120,37 +112,28 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
 def _problem(
     robot: Robot, sources: Sources, args: argparse.Namespace, terminal: Terminal
 ) -> IdentificationProblem:
+    model = read_error_model(args.error_model)
+    if args.prior == TYPICAL:
+        model = with_tolerances(model)
     return IdentificationProblem(
         robot=robot,
         data=sources.data,
+        error_model=model,
         sigma=args.sigma,
+        instrument=instrument_of(args, terminal),
+        prior=prior_of(args, robot, terminal),
         loss=args.loss,
         test_poses=test_poses(robot, args),
-        iterations=args.iterations,
-        prior=prior_of(args, robot, terminal),
-        instrument=instrument_of(args, terminal),
-        discrepancy=args.discrepancy,
-        joint_corrections=args.joint_corrections,
-        starts=args.starts,
         required_accuracy=args.required_accuracy,
-        error_model=None if args.error_model is None else read_error_model(args.error_model),
-        accuracy_frame=args.accuracy_frame or "world",
+        accuracy_frame=args.accuracy_frame,
     )
 
 
 def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args: argparse.Namespace) -> Estimate:
     estimate = identify(problem)
-    if estimate.fit.status == "not_converged":
+    if estimate.fit.status == "not_converged" or not held_out:
         return estimate
-    if held_out:
-        estimate = validate(problem, estimate, held_out, args.validate_target_from)
-    if args.folds is None:
-        return estimate
-    try:
-        return cross_validate(problem, estimate, args.folds, args.seed)
-    except NotEnoughDataError as error:
-        text = f"--folds {args.folds}: too little is left without one part ({error})"
-        raise NotEnoughDataError(error.have, error.need, text) from None
+    return validate(problem, estimate, held_out, args.validate_target_from)
 
 
 def _held_out(path: str, robot: Robot, args: argparse.Namespace, settings: SourceSettings) -> Measurements:
@@ -258,25 +241,19 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
     option(noise, "--sigma", "S", text, kind=float)
     text = "YAML: noise by direction (config/instruments/); the station is in the frame of the points"
     option(noise, "--instrument", "FILE", text)
-    text = "linear: every point counts; robust: points that do not fit are rejected, with the reason"
+    text = "robust: points that the others find impossible are rejected, with the reason; linear: every point "
+    text += "counts; auto: robust, but linear for --error-model paper"
     option(group, "--loss", None, text, DEFAULTS["loss"], choices=LOSSES)
-    text = "auto: residuals beyond the noise count as errors that no geometric model holds; off: they do not"
-    option(group, "--discrepancy", None, text, DEFAULTS["discrepancy"], choices=AUTOMATIC)
-    add_joint_corrections(group, AUTOMATIC)
-    text = (
-        "typical, paper (noise alone), or YAML, also an estimate: gravity, joint functions and repeatability are "
-    )
-    text += "estimated with the parameters, and every visit is predicted from the others (none)"
-    option(group, "--error-model", "E", text)
-    option(group, "--iterations", "N", "largest number of iterations", DEFAULTS["iterations"])
-    option(group, "--starts", "N", "number of other starts, which find other minima", DEFAULTS["starts"])
+    text = "how the robot errs: typical (gravity, joint functions and repeatability are estimated with the "
+    text += "parameters), paper (noise alone), or YAML, also an earlier estimate"
+    option(group, "--error-model", "E", text, TYPICAL)
 
 
 def add_prior(parser: argparse.ArgumentParser) -> None:
     """What is known beforehand."""
     group = parser.add_argument_group("what is known beforehand")
     text = "YAML of expected values and their standard deviations, or an earlier estimate (without its base and "
-    text += f"targets); {TYPICAL}: the data sheet within usual manufacturing errors (none)"
+    text += f"targets); {TYPICAL}: the data sheet within usual manufacturing errors (what the error model says)"
     option(group, "--prior", "FILE", text)
     text = "the reflectors sit where they did in the earlier estimate: take their places over too"
     option(group, "--prior-includes", "tool", text, choices=("tool",))
@@ -289,33 +266,14 @@ def add_checks(parser: argparse.ArgumentParser) -> None:
     text = (
         "world: in the frame of the points; robot: up to a new registration of the robot, at four test poses or "
     )
-    text += "more; needs --error-model (world)"
-    option(check, "--accuracy-frame", None, text, choices=ACCURACIES)
+    text += "more"
+    option(check, "--accuracy-frame", None, text, DEFAULTS["accuracy_frame"], choices=ACCURACIES)
     text = "largest error that is acceptable at a test pose [m] (not checked)"
     option(check, "--required-accuracy", "A", text, kind=float)
     option(check, "--validate", "FILE", "held-out CSV or bag; repeat for several", action="append")
     text = "the reflector was re-seated: its offset comes from the first N rows of each held-out file"
     option(check, "--validate-target-from", "N", text, 0)
-    text = "cross-validation: leave out each of K parts of --data in turn (none)"
-    option(check, "--folds", "K", text, kind=int)
     add_seed(check)
-
-
-def check_error_model(args: argparse.Namespace) -> None:
-    """Refuse options that an error model has no use for, or that need one.
-
-    Raises:
-        InputError: Names the option.
-    """
-    if args.error_model is None:
-        if args.accuracy_frame is not None:
-            raise InputError("--accuracy-frame", args.accuracy_frame, "--error-model beside it")
-        return
-    for name in (*WITHOUT_MODEL, "iterations", "folds", "prior_includes"):
-        given = getattr(args, name)
-        if given != DEFAULTS.get(name):
-            advice = "the error model decides this itself, and predicts every visit from all others"
-            raise InputError(_flag(name), given, "nothing beside --error-model", advice)
 
 
 def prior_of(args: argparse.Namespace, robot: Robot, terminal: Terminal) -> Prior | None:
@@ -329,12 +287,7 @@ def prior_of(args: argparse.Namespace, robot: Robot, terminal: Terminal) -> Prio
         if args.prior_includes:
             got = f"--prior {args.prior}" if args.prior else "no --prior"
             raise InputError("--prior-includes", got, "--prior FILE with an estimate")
-        if args.prior is None:
-            return None
-        prior = typical_prior(robot)
-        if prior is None:
-            terminal.note("No prior: it says nothing about base and targets, and nothing else is identified.")
-        return prior
+        return None
     file = read_prior(args.prior, robot, targets=args.prior_includes == "tool")
     if file.left_out:
         terminal.note(f"{args.prior}: left out of the prior: {', '.join(grouped(file.left_out))}")

@@ -32,8 +32,8 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.sheet import tell_sheet
 from calib_planner.cli.terminal import Terminal, configurations_table
+from calib_planner.error_model import typical_prior
 from calib_planner.errors import InputError
-from calib_planner.identification import typical_prior
 from calib_planner.io import (
     make_folder,
     read_configurations,

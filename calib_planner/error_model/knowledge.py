@@ -124,15 +124,18 @@ class Knowledge:
         hidden = vectors[:, ~shown] / scale[:, None]
         return Knowledge(robot, model, np.zeros(len(matrix)), half @ half.T, hidden)
 
+    @property
+    def placed(self) -> Robot:
+        """The robot with the parameters at their means; right where the joints stand, see ``actual``."""
+        names = self.robot.parameter_names
+        return self.robot.with_deviations(dict(zip(names, self.coefficients[: len(names)], strict=True)))
+
     # ── prediction ───────────────────────────────────────────────────────────────────────────────────
 
     def poses(self, q: ArrayLike, load: FloatArray | None = None) -> Poses:
         """Configurations (N, joints) with parameters and deflections at their means."""
         clean = check_configurations("configurations", q, self.robot.joint_names)
-        names = self.robot.parameter_names
-        deviations = dict(zip(names, self.coefficients[: len(names)], strict=True))
-        robot = self.robot.with_deviations(deviations)
-        readings = Poses(robot, clean, load)
+        readings = Poses(self.placed, clean, load)
         return replace(readings, deflection=self.model.deflection(readings, self.coefficients))
 
     def actual(self, q: ArrayLike) -> FloatArray:

@@ -7,12 +7,18 @@ model as a file to begin from.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from calib_planner.error_model.gravity import Gravity
 from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.model import ErrorModel, Scale
-from calib_planner.error_model.placement import Placement
+from calib_planner.error_model.placement import Placement, is_placement
 from calib_planner.error_model.points import Points
+from calib_planner.error_model.prior import Prior
 from calib_planner.error_model.visits import Visits
+from calib_planner.robot import Robot
 from calib_planner.tracker import Noise
 
 SCALES = tuple(
@@ -53,3 +59,23 @@ def typical(
     elastic = Gravity() if gravity is None else gravity
     points = Points(noise, estimate_scale)
     return ErrorModel(placed, elastic, JointFunctions(), Visits(), points, SCALES, "typical")
+
+
+def with_tolerances(model: ErrorModel) -> ErrorModel:
+    """The model with typical tolerances of the chain, which the data have no say in where it had none."""
+    if model.placement.prior == "tolerance":
+        return model
+    known = tuple(replace(s, factor=1.0) for s in SCALES if s.name in Placement().scales)
+    return replace(model, placement=replace(model.placement, prior="tolerance"), scales=(*model.scales, *known))
+
+
+def typical_prior(robot: Robot) -> Prior | None:
+    """Nominal values with typical tolerances for the active parameters of the chain; ``None``: there are none."""
+    rows = np.flatnonzero(is_placement(robot.parameter_names))
+    if not rows.size:
+        return None
+    values = {s.name: s.value for s in SCALES}
+    std = np.sqrt(Placement().variances(robot, values)[rows])
+    nominal = np.array([p.nominal for p in robot.parameters])[rows]
+    text = f"typical: {1e3 * values['placement.length']:g} mm, {1e3 * values['placement.angle']:g} mrad"
+    return Prior(tuple(robot.parameter_names[i] for i in rows), nominal, std, text)

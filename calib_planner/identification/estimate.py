@@ -1,9 +1,13 @@
-"""The answer of the identification: parameters, how sure they are, and what the residuals say.
+"""The answer of the identification: parameters, what else was learnt, how sure, and what the residuals say.
 
-An ``Estimate`` is made by ``identify`` and completed by ``validate`` and ``cross_validate``. Its parts are frozen
-values of their own: the *fit*, what the data can see (*observability*), the *points* used and rejected, their
-*residuals*, the *noise*, the *accuracy* predicted at the test poses, *diagnostics*, the validations, and the
-*verdict*, which ``verdict.judge`` reaches from all the others.
+An ``Estimate`` is made by ``identify`` and completed by ``validate``. Its parts are frozen values of their own:
+the *fit*, what the data can see (*observability*), the *points* used and rejected, their *residuals*, the *noise*
+of a point, the *accuracy* predicted at the test poses, the *left-out* error, the *terms* of the error model, the
+*alternatives* that explain the data better, the validation, and the *verdict*, which ``verdict.judge`` reaches
+from all the others.
+
+Two models are in it. ``knowledge`` predicts: parameters, gravity, joint functions, everything. ``calibrated`` is
+what a URDF can hold: the parameters of a fit of placement alone, with its own left-out error.
 """
 
 from __future__ import annotations
@@ -18,10 +22,7 @@ from scipy.special import chdtrc
 
 from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
 from calib_planner.error_model import Knowledge, to_mapping
-from calib_planner.identification.checks import Disturbance, HiddenErrors, Structure
-from calib_planner.identification.noise_levels import NoiseLevels
 from calib_planner.identification.term_gain import TermGain
-from calib_planner.identification.transmission import Transmission
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot
 
@@ -120,8 +121,9 @@ class Points:
         measured: Number of points given.
         used: Number of points used.
         rejected: Every point that was not used, in the order of the rows.
-        suspects: Points that were used although their residuals lie beyond the gate.
+        suspects: Points that were used although they are impossible beside the others.
         copies: Number of rows that repeat another one digit for digit.
+        moved_since: First row of those at the end that were all rejected, or ``None``.
     """
 
     measured: int
@@ -129,6 +131,7 @@ class Points:
     rejected: tuple[RejectedPoint, ...]
     suspects: tuple[RejectedPoint, ...]
     copies: int
+    moved_since: int | None
 
 
 @dataclass(frozen=True)
@@ -194,41 +197,41 @@ class Residuals:
         _freeze(self, "vectors", "normalised")
 
 
+@dataclass(frozen=True)
+class PointNoise:
+    """Noise of a measured point: the instrument and the floor below it.
+
+    Attributes:
+        sigma: Standard deviation of one coordinate, root mean square over the points used [m].
+        source: Who says so: ``sigma``, ``instrument``, ``data`` or ``residuals``.
+    """
+
+    sigma: float
+    source: str
+
+
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """Root mean square position errors expected at the test poses [m].
+    """Root mean square position errors expected at the test poses, (M3) [m].
 
     Attributes:
         test_poses: (K, joints) [rad | m].
-        parameters: (K,) ρ0 of eq. (14) with the covariance of the fit [m]; infinite where it depends on what the
-            data cannot see.
-        discrepancy: (K,) what no geometric model holds there [m].
-        complete: (K,) error with joint corrections, or of the error model [m]; ``None`` without either.
+        predicted: (K,) error of ``Estimate.positions`` [m]; infinite where it rests on what the data cannot see.
+        parameters: (K,) what the uncertainty of the parameters has of it [m].
+        placement: (K,) error of ``Estimate.calibrated`` [m]: what it lacks of the mean, and the uncertainty.
+        frame: ``world`` or ``robot``.
         required: Largest error at a pose that the user can live with [m]; NaN: not stated.
     """
 
     test_poses: FloatArray
+    predicted: FloatArray
     parameters: FloatArray
-    discrepancy: FloatArray
-    complete: FloatArray | None = None
+    placement: FloatArray
+    frame: str = "world"
     required: float = float("nan")
 
     def __post_init__(self) -> None:
-        _freeze(self, "test_poses", "parameters", "discrepancy")
-        if self.complete is not None:
-            _freeze(self, "complete")
-
-    @property
-    def geometry(self) -> FloatArray:
-        """(K,) error of ``Estimate.calibrated`` [m]: uncertainty, eq. (14), and discrepancy."""
-        return np.hypot(self.parameters, self.discrepancy)
-
-    @property
-    def predicted(self) -> FloatArray:
-        """(K,) error of ``Estimate.positions`` [m]."""
-        if self.complete is None:
-            return self.geometry
-        return np.where(np.isinf(self.parameters), np.inf, self.complete)
+        _freeze(self, "test_poses", "predicted", "parameters", "placement")
 
     @property
     def overall(self) -> float:
@@ -237,32 +240,8 @@ class Accuracy:
 
     @property
     def worst(self) -> float:
-        """Largest of ``predicted`` [m]."""
-        return float(np.max(self.predicted))
-
-
-@dataclass(frozen=True, eq=False)
-class Diagnostics:
-    """What was checked beside the fit.
-
-    Attributes:
-        structure: Whether the residuals depend on where the robot stood; see ``checks``.
-        disturbances: What seems to have moved while the points were measured; see ``checks``.
-        moved_since: First row of those at the end that were all rejected, or ``None``.
-        hidden: Errors of the joints that the data would not show, and what they would do; ``None`` where they
-            were not looked for or errors were learnt.
-        starts: Number of other starts made.
-        agreeing_starts: Number of those that ended in the same minimum.
-        seconds: Time spent.
-    """
-
-    structure: tuple[Structure, ...]
-    disturbances: tuple[Disturbance, ...]
-    moved_since: int | None
-    hidden: HiddenErrors | None
-    starts: int
-    agreeing_starts: int
-    seconds: float
+        """Largest of ``predicted`` [m]; NaN without test poses."""
+        return float(np.max(self.predicted)) if len(self.test_poses) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -273,13 +252,10 @@ class Validation:
         count: Number of points.
         mean, median, rms, max: After identification.
         before_mean: Mean with the nominal kinematics (only base and targets fitted).
-        predicted_rms: What the covariance, the discrepancy and the measurement noise together predict for rms;
-            NaN where it was not predicted.
-        within_95: Share of the points inside their 95 % region; NaN where it was not predicted.
-        geometry_mean, geometry_rms: With the geometric parameters alone, without joint corrections.
-        folds: Parts of a cross-validation; 0: held-out data.
-        noise_rms: What the measurement of these points alone adds to rms; NaN where it cannot be told from the
-            robot, or was not predicted.
+        predicted_rms: What the error model predicts for rms.
+        within_95: Share of the points inside their 95 % region.
+        placement_mean, placement_rms: With placement alone, as a URDF holds it.
+        noise_rms: What the measurement of these points alone adds to rms; NaN where nobody states it.
     """
 
     count: int
@@ -288,12 +264,11 @@ class Validation:
     rms: float
     max: float
     before_mean: float
-    predicted_rms: float = float("nan")
-    within_95: float = float("nan")
-    geometry_mean: float = float("nan")
-    geometry_rms: float = float("nan")
-    folds: int = 0
-    noise_rms: float = float("nan")
+    predicted_rms: float
+    within_95: float
+    placement_mean: float
+    placement_rms: float
+    noise_rms: float
 
     @property
     def robot_rms(self) -> float:
@@ -343,36 +318,6 @@ class LeftOutError:
         return without_noise(self.rms**2, self.noise_rms**2, self.count)
 
 
-@dataclass(frozen=True, eq=False)
-class Learnt:
-    """What an estimate with an error model has beside the parameters.
-
-    Attributes:
-        knowledge: Parameters and all other coefficients with their covariance: it predicts.
-        terms: Every term of the model asked for, with size and gain.
-        left_out: Left-out error beside its prediction.
-        frame: Of the accuracy at the test poses, ``world`` or ``robot``.
-    """
-
-    knowledge: Knowledge
-    terms: tuple[TermGain, ...]
-    left_out: LeftOutError
-    frame: str = "world"
-
-    def positions(self, q: FloatArray) -> FloatArray:
-        """(N, targets, 3) the mean of what would be measured at ``q`` (N, joints) [m]."""
-        return self.knowledge.poses(q).points
-
-    def to_dict(self) -> dict[str, Any]:
-        """The keys of the contract."""
-        left = asdict(self.left_out)
-        return {
-            "accuracy_frame": self.frame,
-            "left_out": {key: left[key] for key in ("count", "mean", "rms", "max", "predicted_rms")},
-            "error_model": {"terms": [asdict(t) for t in self.terms], "model": to_mapping(self.knowledge.model)},
-        }
-
-
 @dataclass(frozen=True)
 class Reason:
     """One finding of a verdict.
@@ -418,44 +363,47 @@ class Estimate:
     """Identified parameters with their uncertainty, and what is known of the fit.
 
     Attributes:
-        calibrated: The robot with the identified parameters as its nominal ones.
-        transmission: The complete model with the joints' own errors if the data show them; else ``None``.
-        fit: Parameters, standard deviations, covariance.
+        calibrated: The robot with the parameters of a fit of placement alone as its nominal ones: what a URDF or
+            a kinematics file can hold.
+        knowledge: Parameters and all other coefficients with their covariance: it predicts.
+        fit: The parameters of ``knowledge``, standard deviations, covariance.
         observability: What the data can see of the parameters.
         points: Which points were used, and which were rejected.
         residuals: Measured − predicted.
-        noise: The parts of the scatter.
+        noise: Of a point.
         accuracy: Errors predicted at the test poses.
-        diagnostics: What was checked beside the fit.
+        left_out: Error of visits that all others predict, beside its prediction.
+        placement_alone: The same of ``calibrated``.
+        terms: Every term of the error model asked for, with size and gain.
+        seconds: Time spent.
         validation: Statistics on held-out data, if any was given.
-        cross_validation: The same by leaving out parts of the data in turn, if it was requested.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.
-        error_model: What else was learnt, and the left-out error; ``None`` without an error model.
     """
 
     calibrated: Robot
-    transmission: Transmission | None
+    knowledge: Knowledge
     fit: ParameterFit
     observability: Observability
     points: Points
     residuals: Residuals
-    noise: NoiseLevels
+    noise: PointNoise
     accuracy: Accuracy
-    diagnostics: Diagnostics
+    left_out: LeftOutError
+    placement_alone: LeftOutError
+    terms: tuple[TermGain, ...]
+    seconds: float
     validation: Validation | None = None
-    cross_validation: Validation | None = None
     verdict: Verdict = UNJUDGED
-    error_model: Learnt | None = None
 
     def positions(self, q: ArrayLike) -> FloatArray:
-        """Where the targets are according to the complete model: (N, joints) → (N, targets, 3) [m]."""
+        """Where the targets are on average, by all terms: (N, joints) → (N, targets, 3) [m]."""
         clean = check_configurations("configurations", q, self.calibrated.joint_names)
-        return (self.error_model or self.transmission or self.calibrated).positions(clean)
+        return self.knowledge.poses(clean).points
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
         fit, sight, points, residuals = self.fit, self.observability, self.points, self.residuals
-        accuracy, checks = self.accuracy, self.diagnostics
+        accuracy = self.accuracy
         columns = zip(fit.parameters, fit.units, fit.nominal, fit.values, fit.deviations, fit.std, strict=True)
         keys = ("name", "unit", "nominal", "value", "deviation", "std")
         result = {
@@ -476,6 +424,7 @@ class Estimate:
             "rejected": [asdict(p) for p in points.rejected],
             "suspects": [asdict(p) for p in points.suspects],
             "copies": points.copies,
+            "moved_since": points.moved_since,
             "gate": residuals.gate,
             "sigma": self.noise.sigma,
             "sigma_estimate": residuals.sigma,
@@ -485,31 +434,36 @@ class Estimate:
             "residual_after": vars(residuals.after),
             "residuals": residuals.vectors,
             "normalised_residuals": residuals.normalised,
-            "structure": [asdict(s) for s in checks.structure],
-            "disturbances": [asdict(d) for d in checks.disturbances],
-            "moved_since": checks.moved_since,
-            "joint_corrections": None if self.transmission is None else self.transmission.to_dict(),
-            "hidden_joint_errors": None if checks.hidden is None else vars(checks.hidden),
-            "starts": checks.starts,
-            "agreeing_starts": checks.agreeing_starts,
+            "left_out": asdict(self.left_out),
+            "placement_alone": {
+                "parameters": dict(zip(fit.parameters, self.placement_values, strict=True)),
+                "left_out": asdict(self.placement_alone),
+            },
+            "error_model": {
+                "terms": [asdict(t) for t in self.terms],
+                "model": to_mapping(self.knowledge.model),
+            },
             "iterations": fit.iterations,
             "status": fit.status,
             "message": fit.message,
             "verdict": asdict(self.verdict),
             "required_accuracy": accuracy.required,
-            "seconds": checks.seconds,
+            "accuracy_frame": accuracy.frame,
+            "seconds": self.seconds,
         }
         if len(accuracy.test_poses):
             result["test_poses"] = accuracy.test_poses
             result["predicted_accuracy"] = accuracy.overall
             result["predicted_accuracy_per_test_pose"] = accuracy.predicted
-            result["geometry_accuracy_per_test_pose"] = accuracy.geometry
             result["parameter_accuracy_per_test_pose"] = accuracy.parameters
-            result["discrepancy_per_test_pose"] = accuracy.discrepancy
-        for name in ("validation", "cross_validation"):
-            if getattr(self, name) is not None:
-                result[name] = asdict(getattr(self, name))
-        if self.error_model is not None:
-            result |= self.error_model.to_dict()
+            result["placement_accuracy_per_test_pose"] = accuracy.placement
+        if self.validation is not None:
+            result["validation"] = asdict(self.validation)
         plain_result: dict[str, Any] = plain(result)
         return plain_result
+
+    @property
+    def placement_values(self) -> FloatArray:
+        """(P,) values of the parameters in ``calibrated`` [m | rad]."""
+        by_name = {p.name: p.nominal for p in self.calibrated.parameters}
+        return np.array([by_name[name] for name in self.fit.parameters])

@@ -132,7 +132,7 @@ class _Work:
         apart = np.where(data.seen[:, :, None], data.p - poses.points, 0.0).reshape(seen.shape)
         random = np.isfinite(state.model.variances(self.robot))
         stated = None
-        if data.std is not None and state.model.points.noise is None:
+        if data.std is not None:
             std = np.where(data.seen[:, :, None], np.asarray(data.std), 1.0)
             stated = std[..., None] ** 2 * np.eye(3)
         parts = state.model.visit_parts(poses, stated)

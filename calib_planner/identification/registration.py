@@ -50,12 +50,17 @@ class Placement:
         return robot.with_targets(self.offsets) if tool else robot
 
 
-def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Robot:
+CAUCHY_ROUNDS = 30
+"""Most rounds of the weights of a robust registration."""
+
+
+def register(robot: Robot, data: Measurements, *, base: bool, tool: bool, robust: bool = False) -> Robot:
     """``robot`` with the base pose and target offsets that fit the nominal kinematics best.
 
     Args:
         base: The tracker's pose is unknown; otherwise the robot's base pose is kept.
         tool: The target offsets are unknown; otherwise the robot's targets are kept.
+        robust: Whether far points count little.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknowns, or all configurations alike.
@@ -63,7 +68,18 @@ def register(robot: Robot, data: Measurements, *, base: bool, tool: bool) -> Rob
     if not (base or tool):
         return robot
     poses = tip_poses(robot, data.q, at_base=base)
-    return place(robot, data, poses, base=base, tool=tool).of(robot, base=base, tool=tool)
+    placed, weights = place(robot, data, poses, base=base, tool=tool), np.ones(data.seen.shape)
+    for _ in range(CAUCHY_ROUNDS if robust else 0):
+        lengths = np.linalg.norm(data.p - placed.positions(poses), axis=2)
+        scale = float(np.nanmedian(lengths))
+        if scale == 0.0:
+            break
+        new = np.where(data.seen, 1.0 / (1.0 + (lengths / scale) ** 2), 0.0)
+        settled, weights = np.nanmax(np.abs(new - weights)) < 1e-3, new
+        placed = place(robot, data, poses, base=base, tool=tool, weights=weights)
+        if settled:
+            break
+    return placed.of(robot, base=base, tool=tool)
 
 
 def place(

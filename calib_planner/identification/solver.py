@@ -1,251 +1,387 @@
-"""Identification: from measurements to parameters, in the order in which doubt is resolved.
+"""Identification, from a problem to its estimate.
 
-1. start       tracker pose and targets in closed form (``registration``)
-2. which       an irreducible set of parameters (``design.identifiability``)
-3. who         points to believe, if the loss is robust (``robust``)
-4. how much    the paper's iteration (``least_squares``) with weights (``weighing``): a fit that measurement noise
-               does not explain gets a discrepancy, and new weights, before 3 is looked at again
-5. how sure    other starts must end in the same place; cov(Π̂) of eq. (11) with the final weights
-6. what else   residuals that know where the robot stood: errors of the joints (``transmission``), and those that
-               the residuals could not show (``hidden_errors``)
+1. start      Base and targets, where they are unknown, in closed form (``registration``).
+2. which      Combinations of the parameters that neither data nor error model determine are left out: one
+              parameter of each stays at its nominal value (or at its closed-form start).
+3. fit        Parameters, all other coefficients and the scales of the error model (``estimation``).
+4. alone      The same without gravity and joint functions: what a URDF can hold.
+5. estimate   What the fit says, in the words of ``Estimate``, with its verdict.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, one_thread
-from calib_planner.identification.by_model import identify_by_model
-from calib_planner.identification.checks import (
-    SIGNIFICANT,
-    Disturbance,
-    HiddenErrors,
-    Structure,
-    check_distances,
-    check_order,
-    check_units,
-    hidden_errors,
-    instead_of_discrepancy,
-    rejected_since,
-    residual_structure,
-    wholly_whitened,
+from calib_planner.error_model import ErrorModel, Knowledge
+from calib_planner.errors import InputError, NotEnoughDataError
+from calib_planner.identification.doubt import gate_of, squares_of_points
+from calib_planner.identification.estimate import (
+    Accuracy,
+    ChiSquare,
+    Estimate,
+    LeftOutError,
+    Observability,
+    ParameterFit,
+    PointNoise,
+    Points,
+    Residuals,
+    residual_statistics,
 )
-from calib_planner.identification.estimate import Estimate
-from calib_planner.identification.evidence import Evidence, estimate_of
-from calib_planner.identification.least_squares import Fit, gauss_newton
-from calib_planner.identification.noise_levels import improbable
+from calib_planner.identification.estimation import ModelEstimate, fit_error_model
+from calib_planner.identification.left_out import LeftOut
 from calib_planner.identification.problem import IdentificationProblem
-from calib_planner.identification.robust import (
-    gate_of,
-    normalised,
-    select,
-)
-from calib_planner.identification.start import check_count, start_robot
-from calib_planner.identification.transmission import Transmission, fit_transmission, geometry_covariance
-from calib_planner.identification.weighing import TINY, Weighed, Work, weigh, without_unseen
-from calib_planner.robot import Robot
+from calib_planner.identification.registration import register
+from calib_planner.identification.rejection import copied_rows, explain, rejected_since
+from calib_planner.identification.verdict import judged
+from calib_planner.measurements import Measurements, RejectedPoint
+from calib_planner.robot import BASE_PARAMETERS, Identifiability, Robot, analyse, describe, target_parameters
+from calib_planner.units import length
 
-MOST_GATES = 12
-"""Rounds of the gate; a selection that still changes then is taken as it is."""
-START_LENGTH = 5e-3
-"""Standard deviation of the lengths of other starts [m]."""
-START_ANGLE = 2e-2
-"""The same for angles [rad]."""
+BoolArray = NDArray[np.bool_]
+NOTHING_HIDDEN = Identifiability((), (), (), np.empty((0, 0)), ())
+BLIND = 1e-5
+"""Least motion of a point that tells that a test pose feels what the data cannot see [m per unit]."""
+WEAK = 1e-2
+"""Directions of unit-length columns with less than this length are hardly seen."""
+WRONG_UNIT = (200.0, 5000.0)
+"""Measured points spread this much wider than the model's: millimetres where metres are wanted."""
 
 
 @one_thread
-def identify(problem: IdentificationProblem, start: Estimate | None = None) -> Estimate:
-    """Identify the active parameters.
-
-    Args:
-        problem: What is asked. With an ``error_model`` the steps are those of ``estimation``.
-        start: Values to go on from where a first fit from nominal ones has not come near the minimum, such as the
-            estimate before the newest measurement; saves time, the answer is the same.
+def identify(problem: IdentificationProblem) -> Estimate:
+    """Identify the active parameters and all else that the error model has.
 
     Raises:
-        NotEnoughDataError: Fewer equations than parameters, or fewer good points than are needed.
+        NotEnoughDataError: Fewer equations than unknown parameters, or most points disagree.
         InputError: The points look like millimetres.
     """
-    if problem.error_model is not None:
-        return identify_by_model(problem)
     began = time.perf_counter()
     check_units(problem.robot, problem.data)
-    robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
     check_count(problem, problem.data.seen)
-    # What is decided on the way is decided from nominal: no start can tip it.
-    work, first, near = _begun(problem, robot)
-    if start is not None and problem.loss == "linear" and not near:
-        first = work.start_values(start)
-    found = weigh(work, work.use, first)
-    if problem.loss == "robust":
-        found = _gated(work, found)
-    found, starts, agreeing = _other_starts(work, found)
-    structure = _structure(work, found)
-    transmission = _transmission(work, found, structure)
-    evidence = Evidence(
-        problem=problem,
-        robot=robot,
-        equations=found.equations,
-        fit=found.fit,
-        identifiability=work.identifiability,
-        resolved=tuple(sorted(set(found.fit.kept) & set(work.identifiability.fixed))),
-        levels=found.levels,
-        covariance=_covariance(work, found, transmission),
-        chi_square=found.chi_square,
-        freedom=found.freedom,
-        normalised=_normalised(work, found),
-        gate=_gate(found),
-        at=work.at,
-        jacobian=work.jacobian,
-        structure=structure,
-        disturbances=_disturbances(work, found),
-        moved_since=rejected_since(problem.data.seen, found.equations.use),
-        transmission=transmission,
-        hidden=_hidden(work, found, transmission),
-        starts=starts,
-        agreeing=agreeing,
+    robot = start_robot(problem.robot, problem.data, robust=problem.robust)
+    # A fit may run so far along what it cannot see that it seems to see it: this is decided first at the start.
+    rows = np.repeat(problem.data.seen, 3, axis=1)
+    hidden = _hidden(problem.model, robot, robot.jacobian(problem.data.q)[rows])
+    fit = _fit(problem, problem.model, robot, hidden)
+    if fit.knowledge.hidden.shape[1]:
+        hidden = _hidden(problem.model, robot, fit.knowledge.poses(problem.data.q).jacobian[rows])
+        fit = _fit(problem, problem.model, robot, hidden)
+    check_count(problem, problem.data.seen & (fit.doubt == 0.0))
+    alone = fit
+    if len(fit.knowledge.model.systematic) > 1:
+        used = problem.data.without(_points(fit.doubt))
+        terms = replace(problem.model, gravity=None, joint_functions=None)
+        alone = _fit(replace(problem, data=used, error_model=terms), terms, robot, hidden)
+    return _estimate(problem, fit, alone, hidden, robot, began)
+
+
+# ── before the fit ───────────────────────────────────────────────────────────────────────────────────
+
+
+def start_robot(robot: Robot, data: Measurements, *, robust: bool = False) -> Robot:
+    """``robot`` with its unknown base and targets, if any, at their closed-form values for these data."""
+    active = set(robot.parameter_names)
+    base, tool = active.issuperset(BASE_PARAMETERS), active.issuperset(target_parameters(len(robot.targets)))
+    return register(robot, data, base=base, tool=tool, robust=robust)
+
+
+def check_count(problem: IdentificationProblem, use: BoolArray) -> None:
+    """More equations than parameters, and not more points rejected than used."""
+    names = problem.robot.parameter_names
+    count, equations = len(names), 3 * int(use.sum())
+    flat = int(np.isinf(problem.model.variances(problem.robot)[:count]).sum())
+    measured = int(problem.data.seen.sum())
+    if 2 * int(use.sum()) < measured:
+        raise NotEnoughDataError(
+            equations,
+            count,
+            f"only {int(use.sum())} of {measured} points agree with one another: check joint order, units and "
+            "which point belongs to which row before calibrating",
+        )
+    if equations < flat:
+        each = 3 * problem.data.p.shape[1]
+        raise NotEnoughDataError(
+            equations,
+            flat,
+            f"{equations} equations for {flat} parameters of which nothing is known: measure at least "
+            f"{-(-flat // each)} configurations, or ask for fewer parameters",
+        )
+
+
+def check_units(robot: Robot, data: Measurements) -> None:
+    """Refuse points in millimetres, and a robot model in millimetres.
+
+    Raises:
+        InputError: The points spread about a thousand times more, or less, than the robot can move them.
+    """
+    seen = data.seen
+    if seen.sum() < 3:
+        return
+    measured = _extent(data.p[seen])
+    expected = _extent(robot.positions(data.q)[seen])
+    if measured == 0.0 or expected == 0.0:
+        return
+    ratio = measured / expected
+    got = f"points {measured:.3g} apart where the robot model moves them by {expected:.3g}"
+    if WRONG_UNIT[0] < ratio < WRONG_UNIT[1]:
+        advice = "they look like millimetres: divide by 1000 (command line: --millimetres)"
+        raise InputError("points", got, "coordinates in metres", advice)
+    if WRONG_UNIT[0] < 1.0 / ratio < WRONG_UNIT[1]:
+        advice = "the model's lengths look like millimetres: give them in metres"
+        raise InputError("robot", got, "lengths in metres", advice)
+
+
+def _extent(points: FloatArray) -> float:
+    """Median distance from the median point [m]: blind to a few gross errors."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
+def place_nominal(problem: IdentificationProblem) -> Robot:
+    """The nominal kinematics with base and targets, where they are unknown, fitted to the data."""
+    active = set(problem.robot.parameter_names)
+    groups = (BASE_PARAMETERS, target_parameters(len(problem.robot.targets)))
+    names = [n for group in groups if active.issuperset(group) for n in group]
+    if not names:
+        return problem.robot
+    robot = start_robot(problem.robot, problem.data, robust=problem.robust)
+    known = fit_error_model(replace(robot, parameter_names=tuple(names)), problem.data, ErrorModel.paper(1e-3))
+    return replace(known.knowledge.placed, parameter_names=robot.parameter_names)
+
+
+# ── what cannot be seen ──────────────────────────────────────────────────────────────────────────────
+
+
+def _hidden(model: ErrorModel, robot: Robot, rows: FloatArray) -> Identifiability:
+    """Combinations of the parameters that nothing tells, from the Jacobian's ``rows`` (equations, P)."""
+    names = robot.parameter_names
+    flat = np.flatnonzero(np.isinf(model.variances(robot)[: len(names)]))
+    if not flat.size:
+        return NOTHING_HIDDEN
+    seen = analyse(rows[:, flat], [names[i] for i in flat])
+    directions = np.zeros((len(seen.fixed), len(names)))
+    directions[:, flat] = seen.directions
+    return replace(seen, fixed=tuple(int(flat[i]) for i in seen.fixed), directions=directions)
+
+
+def _decided_by_prior(robot: Robot, rows: FloatArray, hidden: Identifiability) -> tuple[str, ...]:
+    """Combinations that the data cannot see, and that the error model's prior decides."""
+    seen = analyse(rows, robot.parameter_names)
+    pairs = zip(seen.fixed, seen.combinations, strict=True)
+    return tuple(text for i, text in pairs if i not in hidden.fixed)
+
+
+def _hardly_seen(names: tuple[str, ...], covariance: FloatArray, fixed: tuple[int, ...]) -> tuple[str, ...]:
+    """Combinations of the free parameters that data and prior hardly tell, weakest first."""
+    free = [i for i in range(len(names)) if i not in fixed]
+    if not free:
+        return ()
+    scale = np.sqrt(np.diag(covariance)[free])
+    values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(scale, scale)
+    length_of = np.sqrt(np.diag(inverse))
+    weak, directions = np.linalg.eigh(inverse / np.outer(length_of, length_of))
+    result = []
+    for value, direction in zip(np.sqrt(np.maximum(weak, 0.0)), directions.T, strict=True):
+        if value > WEAK:
+            break
+        change = np.zeros(len(names))
+        change[free] = np.where(np.abs(direction) > 0.1 * np.abs(direction).max(), direction / length_of, 0.0)
+        first = int(np.argmax(np.abs(change)))
+        result.append(describe(change / change[first], names, first))
+    return tuple(result)
+
+
+def _blind_poses(problem: IdentificationProblem, robot: Robot, directions: FloatArray) -> BoolArray:
+    """(K,) whether a test pose moves with one of ``directions`` (fixed, P) far more than any measured point."""
+    poses, data = problem.test_pose_array, problem.data
+    if not len(directions):
+        return np.zeros(len(poses), bool)
+    moved = robot.jacobian(data.q) @ directions.T
+    moved = np.where(np.repeat(data.seen, 3, axis=1)[:, :, None], moved, 0.0)
+    seen = np.linalg.norm(moved.reshape(*data.p.shape, -1), axis=2).max(axis=(0, 1))
+    felt = robot.jacobian(poses) @ directions.T
+    return np.asarray((np.linalg.norm(felt, axis=1) > 10.0 * seen + BLIND).any(axis=1))
+
+
+def _fit(
+    problem: IdentificationProblem, model: ErrorModel, robot: Robot, hidden: Identifiability
+) -> ModelEstimate:
+    """The fit without one parameter of each hidden combination; all of them are in its knowledge again."""
+    names = robot.parameter_names
+    free = tuple(n for i, n in enumerate(names) if i not in hidden.fixed)
+    if not hidden.fixed or not free:
+        return fit_error_model(robot, problem.data, model, robust=problem.robust)
+    fit = fit_error_model(replace(robot, parameter_names=free), problem.data, model, robust=problem.robust)
+    known = fit.knowledge
+    own = known.model.names(replace(known.robot, parameter_names=names))
+    place = [own.index(n) for n in known.model.names(known.robot)]
+    coefficients, covariance = np.zeros(len(own)), np.zeros((len(own), len(own)))
+    coefficients[place] = known.coefficients
+    covariance[np.ix_(place, place)] = known.covariance
+    unseen = np.zeros((len(own), known.hidden.shape[1]))
+    unseen[place] = known.hidden
+    placed = replace(known.robot, parameter_names=names)
+    return replace(fit, knowledge=Knowledge(placed, known.model, coefficients, covariance, unseen))
+
+
+# ── the parts of the estimate ────────────────────────────────────────────────────────────────────────
+
+
+def _estimate(
+    problem: IdentificationProblem,
+    fit: ModelEstimate,
+    alone: ModelEstimate,
+    hidden: Identifiability,
+    start: Robot,
+    began: float,
+) -> Estimate:
+    """The answer, with its verdict."""
+    known, data, model = fit.knowledge, problem.data, problem.model
+    names = known.robot.parameter_names
+    seen, use = data.seen, data.seen & (fit.doubt == 0.0)
+    deviations, covariance = known.coefficients[: len(names)], known.covariance[: len(names), : len(names)]
+    std = np.sqrt(np.diag(covariance))
+    std[list(hidden.fixed)] = np.nan
+    status = "not_converged" if not fit.converged else "rank_deficient" if hidden.fixed else "ok"
+    predicted = known.poses(data.q).points
+    residuals = data.p - predicted
+    normalised = np.where(seen, np.sqrt(squares_of_points(fit.solution, fit.doubt)[0]), np.nan)
+    gate = float(np.sqrt(gate_of(int(seen.sum()))))
+    before = data.p - place_nominal(problem).positions(data.q)
+    source = problem.noise_source
+    linear, rank = fit.solution.problem, len(names) - len(hidden.fixed)
+    flat, spare = linear.basis.shape[1], 3 * int(use.sum()) - rank
+    chi = float(np.sum(linear.y * fit.solution.weighted))
+    scatter = float(np.sqrt(np.sum(residuals[use] ** 2) / spare)) if spare > 0 else float("nan")
+    rows = start.jacobian(data.q)[np.repeat(seen, 3, axis=1)]
+    off = _point_rows(problem, predicted, normalised, seen & ~use, gate)
+    suspects = _point_rows(problem, predicted, normalised, use & (np.nan_to_num(normalised) > gate), gate)
+    calibrated = alone.knowledge.placed
+    estimate = Estimate(
+        calibrated=calibrated,
+        knowledge=known,
+        fit=ParameterFit(
+            parameters=names,
+            units=tuple(p.unit for p in known.robot.parameters),
+            nominal=np.array([p.nominal for p in known.robot.parameters]),
+            deviations=deviations,
+            std=std,
+            covariance=covariance,
+            iterations=fit.rounds,
+            status=status,
+        ),
+        observability=Observability(
+            rank=rank,
+            fixed=tuple(names[i] for i in hidden.fixed),
+            unidentifiable=hidden.combinations,
+            resolved_by_prior=_decided_by_prior(start, rows, hidden),
+            nearly_dependent=_hardly_seen(names, covariance, hidden.fixed),
+            prior=_prior_words(model),
+        ),
+        points=Points(
+            measured=int(seen.sum()),
+            used=int(use.sum()),
+            rejected=off,
+            suspects=suspects if not problem.robust else (),
+            copies=copied_rows(data),
+            moved_since=rejected_since(seen, use),
+        ),
+        residuals=Residuals(
+            vectors=residuals,
+            normalised=normalised,
+            gate=gate,
+            before=residual_statistics(np.linalg.norm(before, axis=2)[use]),
+            after=residual_statistics(np.linalg.norm(residuals, axis=2)[use]),
+            sigma=scatter,
+            chi_square=ChiSquare(chi, int(linear.seen.sum()) - flat),
+        ),
+        noise=PointNoise(_point_sigma(fit, use), source),
+        accuracy=_accuracy(problem, known, calibrated, _blind_poses(problem, start, hidden.directions)),
+        left_out=_left_out_error(fit.left_out, fit, source),
+        placement_alone=_left_out_error(alone.left_out, alone, source),
+        terms=fit.terms,
         seconds=time.perf_counter() - began,
     )
-    return estimate_of(evidence)
+    return judged(estimate)
 
 
-# ── points come and go ───────────────────────────────────────────────────────────────────────────────
+def _prior_words(model: ErrorModel) -> str:
+    """What is known of the parameters beforehand; empty if nothing is."""
+    stated = model.placement.stated
+    if stated is not None:
+        return stated.source
+    return "" if model.placement.prior == "flat" else f"the tolerances of the error model '{model.name}'"
 
 
-def _begun(problem: IdentificationProblem, robot: Robot) -> tuple[Work, FloatArray, bool]:
-    """``without_unseen`` of the points to begin with: all, or those that a fit forgetting far ones believes."""
-    seen = problem.data.seen
-    whole = Work.of(problem, robot, seen)
-    work, first, near = without_unseen(whole)
-    if problem.loss != "robust":
-        return work, first, near
-    known = work.source != "residuals"
-    use = select(work.equations(seen, work.instrument), work.kept, first, scale_known=known)
-    check_count(problem, use)
-    return (work, first, near) if (use == seen).all() else without_unseen(whole.told_by(use))
+def _points(doubt: FloatArray) -> list[RejectedPoint]:
+    """Those that lost their weight, for ``Measurements.without``."""
+    return [RejectedPoint(i, t + 1, "", np.nan, np.nan) for i, t in np.argwhere(doubt > 0.0).tolist()]
 
 
-def _gated(work: Work, found: Weighed) -> Weighed:
-    """Points go and come back until the selection stands still."""
-    seen, use = work.problem.data.seen, found.equations.use
-    for _ in range(MOST_GATES):
-        distance = _normalised(work, found)
-        with np.errstate(invalid="ignore"):
-            new = seen & (distance <= _gate(found))
-        if (new == use).all():
-            break
-        use = new
-        check_count(work.problem, use)
-        found = weigh(work, use, found.fit.deviations, found.levels)
-    return found
+def _left_out_error(left: LeftOut, fit: ModelEstimate, source: str) -> LeftOutError:
+    """(M4) of the points that count."""
+    part = fit.solution.problem.parts.get("instrument")
+    told = residual_statistics(left.distances)
+    noise = float("nan")
+    if part is not None and source != "residuals" and left.usable.any():
+        noise = float(np.sqrt(np.mean(_variances(part, left.usable))))
+    return LeftOutError(int(left.usable.sum()), told.mean, told.rms, told.max, left.predicted_rms, noise)
 
 
-def _gate(found: Weighed) -> float:
-    """Largest believable normalised residual."""
-    count = int(found.equations.data.seen.sum())
-    stated = found.levels.source in ("sigma", "data", "instrument") and not found.levels.discrepancy
-    if not stated:
-        return gate_of(count, found.freedom)
-    if not improbable(found.chi_square, found.freedom):
-        return gate_of(count)
-    # No discrepancy was allowed to explain the residuals: far is what is far from the others.
-    return gate_of(count, found.freedom) * float(np.sqrt(found.chi_square / found.freedom))
+def _variances(part: FloatArray, use: BoolArray) -> FloatArray:
+    """(points,) sum of the three variances of each point in use, from (N, 3·targets, 3·targets) [m²]."""
+    diagonal = np.diagonal(part, axis1=1, axis2=2)
+    return np.asarray(diagonal.reshape(*use.shape, 3).sum(axis=2)[use])
 
 
-def _normalised(work: Work, found: Weighed) -> FloatArray:
-    """(N, targets) length of each residual in standard deviations of what it should be."""
-    return normalised(found.residuals, found.residual_covariance())
+def _point_sigma(fit: ModelEstimate, use: BoolArray) -> float:
+    """Standard deviation of a coordinate of a point [m]: the instrument and the floor below it."""
+    parts = fit.solution.problem.parts
+    own = sum((parts[n] for n in ("instrument", "floor") if n in parts), np.zeros(1))
+    return float(np.sqrt(np.mean(_variances(np.asarray(own), use)) / 3.0))
 
 
-# ── is it the only minimum? ──────────────────────────────────────────────────────────────────────────
+def _accuracy(problem: IdentificationProblem, known: Knowledge, calibrated: Robot, blind: BoolArray) -> Accuracy:
+    """(M3) at the test poses; infinite at those (K,) that are ``blind``."""
+    poses = problem.test_pose_array
+    required = float("nan") if problem.required_accuracy is None else problem.required_accuracy
+    if not len(poses):
+        nothing = np.empty(0)
+        return Accuracy(poses, nothing, nothing, nothing, problem.accuracy_frame, required)
+    complete = np.where(blind, np.inf, known.accuracy(poses, problem.accuracy_frame).per_pose)
+    told = known.predict(poses)
+    own = np.sqrt(np.trace(told.parameters, axis1=2, axis2=3).mean(axis=1))
+    missed = np.sqrt(np.sum((told.mean - calibrated.positions(poses)) ** 2, axis=2).mean(axis=1))
+    return Accuracy(
+        test_poses=poses,
+        predicted=complete,
+        parameters=np.where(np.isinf(complete), np.inf, own),
+        placement=np.hypot(complete, missed),
+        frame=problem.accuracy_frame,
+        required=required,
+    )
 
 
-def _other_starts(work: Work, found: Weighed) -> tuple[Weighed, int, int]:
-    """Begin elsewhere, with the same points and weights: best fit, starts made, starts that ended with it."""
-    rng = np.random.default_rng(0)
-    angle = np.array([p.unit == "rad" for p in work.robot.parameters])
-    spread = np.where(angle, START_ANGLE, START_LENGTH)
-    kept, best, agreeing = list(found.fit.kept), found.fit, 0
-    for _ in range(work.problem.starts):
-        first = found.fit.deviations.copy()
-        first[kept] += spread[kept] * rng.standard_normal(len(kept))
-        close = 1e-6 * best.cost + 1e-6
-        same = best.cost + 0.5 * close
-        other = gauss_newton(found.equations, first, found.fit.kept, work.problem.iterations, enough=same)
-        if other.cost < best.cost - close and other.converged:
-            best, agreeing = other, 0
-        agreeing += int(abs(other.cost - best.cost) <= close and _same(other, best))
-    if best is not found.fit:
-        # The first start was one of those that ended elsewhere.
-        found, agreeing = (
-            weigh(work, found.equations.use, best.deviations),
-            min(agreeing, work.problem.starts - 1),
-        )
-    return found, work.problem.starts, agreeing
-
-
-def _same(one: Fit, other: Fit) -> bool:
-    """Whether two fits ended in one place: closer than a standard deviation in every parameter."""
-    kept = list(one.kept)
-    std = np.sqrt(np.diag(one.covariance())[kept])
-    return bool((np.abs(one.deviations - other.deviations)[kept] <= std).all())
-
-
-# ── do the residuals know where the robot stood, or when? ─────────────────────────────────────────────────────
-
-
-def _structure(work: Work, found: Weighed) -> tuple[Structure, ...]:
-    use, q = found.equations.use, work.problem.data.q
-    return residual_structure(work.robot, q, found.residuals, use, work.labels)
-
-
-def _transmission(work: Work, found: Weighed, structure: tuple[Structure, ...]) -> Transmission | None:
-    """Errors of the joints' transmissions, if there is reason to look for them."""
-    reason = found.levels.discrepancy > 0 or any(s.probability < SIGNIFICANT for s in structure)
-    if work.problem.joint_corrections == "off" or not reason or not found.fit.converged:
-        return None
-    instrument = _instrument(work, found)
-    return fit_transmission(found.equations, found.fit.deviations, found.fit.kept, instrument, work.labels)
-
-
-def _instrument(work: Work, found: Weighed) -> FloatArray:
-    """Where the instrument's noise is unknown it is part of the white noise that is estimated there."""
-    if found.levels.source == "residuals":
-        return TINY * work.instrument
-    if found.levels.source == "repetitions":
-        return (found.levels.measurement / work.unit) ** 2 * work.instrument
-    return found.levels.scaled**2 * work.instrument
-
-
-def _covariance(work: Work, found: Weighed, transmission: Transmission | None) -> FloatArray:
-    """cov(Π̂): configurations that share a joint angle share its error, as far as that is known."""
-    if transmission is None:
-        return found.covariance
-    return geometry_covariance(transmission, found.equations, found.fit, _instrument(work, found), work.labels)
-
-
-def _hidden(work: Work, found: Weighed, transmission: Transmission | None) -> HiddenErrors | None:
-    """Errors of the joints that the data would not have shown, where none were learnt."""
-    if work.problem.joint_corrections == "off" or transmission is not None or not found.fit.converged:
-        return None
-    white = wholly_whitened(found.equations, work.instrument, found.levels, work.labels)
-    return hidden_errors(found.equations, white, found.fit, found.levels, work.problem.test_pose_array)
-
-
-def _disturbances(work: Work, found: Weighed) -> tuple[Disturbance, ...]:
-    """What seems to have moved during the campaign, and matters."""
-    if work.problem.order_check == "off" or not found.fit.converged:
-        return ()
-    white = wholly_whitened(found.equations, work.instrument, found.levels, work.labels)
-    fitted, levels = (found.fit.deviations, found.fit.kept, found.covariance), found.levels
-    asked = check_order(white, *fitted)
-    if levels.discrepancy > 0 and levels.source != "residuals" and not any(d.matters for d in asked):
-        noisy = work.equations(found.equations.use, _instrument(work, found))
-        repeats = levels.repeat_freedom if levels.source == "repetitions" else 0
-        distances = check_distances(noisy, *fitted)
-        others = (*check_order(noisy, *fitted), *(() if distances is None else (distances,)))
-        other = instead_of_discrepancy(others, repeats)
-        asked = () if other is None else (other,)
-    return tuple(d for d in asked if d.matters)
+def _point_rows(
+    problem: IdentificationProblem, predicted: FloatArray, normalised: FloatArray, out: BoolArray, gate: float
+) -> tuple[RejectedPoint, ...]:
+    """A row per point of ``out`` (N, targets): where, how far off, and why."""
+    data = problem.data
+    off = np.linalg.norm(data.p - predicted, axis=2)
+    # A point belongs to another row's prediction if it meets it as well as the used points meet theirs.
+    used = off[data.seen & ~out]
+    words = explain(predicted, data, out, 3.0 * float(used.max(initial=0.0)) + 1e-6) if out.any() else {}
+    result = []
+    for i, t in np.argwhere(out).tolist():
+        ratio, error = float(normalised[i, t]), float(off[i, t])
+        reason = f"{ratio:.3g} standard deviations (gate {gate:.3g}) from where the others put it"
+        reason += f", {length(error)} off"
+        reason += "" if ratio > gate else "; one of a run of visits that are all shifted"
+        reason += f"; {words[i, t]}" if (i, t) in words else ""
+        result.append(RejectedPoint(i, t + 1, reason, ratio, error))
+    return tuple(result)

@@ -10,8 +10,9 @@ file holds both as they were identified:
     base: {x, y, z, yaw, pitch, roll, rx, ry, rz}    # the robot in the tracker's frame [m, rad]
     targets: [[x, y, z], …]                          # in the tip's frame [m]
 
-An estimate by an error model holds what predicts again, in ``error_model``: beside the terms and the model (see
-``error_model.to_mapping``) the start of base and targets, from which their parameters are deviations, and
+These two, and ``placement_alone``, are of the fit of placement alone: what a URDF can hold. What predicts is in
+``error_model``: beside the terms and the model (see ``error_model.to_mapping``) the start of base and targets,
+from which their parameters are deviations, and
 
     names: [...]               # of the coefficients β, parameters first
     coefficients: [...]        # their mean
@@ -37,9 +38,9 @@ import numpy as np
 from calib_planner.arrays import FloatArray, frozen, plain
 from calib_planner.error_model import ErrorModel, Knowledge, from_mapping
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.identification import ChiSquare, Estimate, JointCorrections, NoiseLevels, Reason, Verdict
+from calib_planner.identification import ChiSquare, Estimate, PointNoise, Reason, Verdict
 from calib_planner.io.yaml import Node, read_document, write_document
-from calib_planner.robot import Element, Robot, is_nuisance
+from calib_planner.robot import Robot, is_nuisance
 
 T = TypeVar("T")
 BASE = ("x", "y", "z", "yaw", "pitch", "roll", "rx", "ry", "rz")
@@ -49,12 +50,11 @@ SAME = 1e-9
 TARGET = re.compile(r"target_([1-9]\d{0,2})\.([xyz])")
 PARAMETER_KEYS = ("name", "unit", "nominal", "value", "deviation", "std")
 NEEDED = ("robot", "joint_names", "parameters", "covariance", "sigma", "status")
-SERIES = ("scale", "shift", "cosines", "sines")
 PER_POSE = "predicted_accuracy_per_test_pose"
 UNLIMITED = {
     PER_POSE: "predicted",
     "predicted_accuracy": "overall",
-    "geometry_accuracy_per_test_pose": "geometry",
+    "placement_accuracy_per_test_pose": "placement",
     "parameter_accuracy_per_test_pose": "parameters",
     "required_accuracy": "required",
 }
@@ -75,8 +75,7 @@ def document_of(estimate: Estimate) -> dict[str, Any]:
     """What ``write_estimate`` writes, without its format line, as plain values."""
     content = estimate.to_dict()
     unlimited = {key: getattr(estimate.accuracy, name) for key, name in UNLIMITED.items() if key in content}
-    if estimate.error_model is not None:
-        content["error_model"] |= plain(_knowledge_mapping(estimate.error_model.knowledge))
+    content["error_model"] |= plain(_knowledge_mapping(estimate.knowledge))
     return content | plain(unlimited, keep_infinite=True) | placement(estimate)
 
 
@@ -138,13 +137,13 @@ def parse_estimate(top: Node) -> SavedEstimate:
         status=top["status"].of_kind("str"),
         base=None if base.value is None else _in_order(base, BASE),
         targets=None if targets.value is None else targets.array((None, 3)),
-        noise=_made(top.get("noise"), NoiseLevels),
+        noise=_noise(top.get("noise")),
         chi_square=_made(top.get("chi_square"), ChiSquare, ("probability",)),
         verdict=_verdict(top.get("verdict")),
         predicted_accuracy_per_test_pose=Node(top.path, PER_POSE, top.get(PER_POSE).value or []).array(
             (None,), finite=False
         ),
-        joint_corrections=_corrections(top, names),
+        placement_alone=_placement_alone(top, names),
         learnt=_learnt(top.get("error_model")),
         document=dict(top.value),
     )
@@ -178,19 +177,18 @@ def _made(node: Node, kind: type[T], more: tuple[str, ...] = ()) -> T | None:
     return kind(**{name: item(name) for name in kinds if name in node})
 
 
-def _corrections(top: Node, names: tuple[str, ...]) -> SavedCorrections | None:
-    node = top.get("joint_corrections")
+def _noise(node: Node) -> PointNoise | None:
+    """Noise of a point; what older files say beside it is left aside."""
     if node.value is None:
         return None
-    node.mapping(None, ("parameters", *SERIES))
-    joints = tuple(top["joint_names"].value)
-    count = len(joints)
-    shapes = {"scale": (count,), "shift": (count,), "cosines": (count, None), "sines": (count, None)}
-    series = {name: node[name].array(shapes[name]) for name in SERIES}
-    if series["cosines"].shape != series["sines"].shape:
-        expected = f"shape {series['cosines'].shape}, as cosines"
-        raise node["sines"].error(f"shape {series['sines'].shape}", expected)
-    return SavedCorrections(JointCorrections(joints, **series), names, _in_order(node["parameters"], names))
+    node.mapping(None, ("sigma", "source"))
+    return PointNoise(_float(node["sigma"]), node["source"].of_kind("str"))
+
+
+def _placement_alone(top: Node, names: tuple[str, ...]) -> FloatArray | None:
+    if "placement_alone" not in top:
+        return None
+    return _in_order(top["placement_alone"]["parameters"], names)
 
 
 def _learnt(node: Node) -> SavedKnowledge | None:
@@ -236,21 +234,6 @@ def _verdict(node: Node) -> Verdict | None:
 
 
 @dataclass(frozen=True, eq=False)
-class SavedCorrections:
-    """The complete model: joint corrections and the geometry that belongs with them.
-
-    Attributes:
-        corrections: φ of every joint.
-        parameters: P names.
-        values: (P,) their values beside the corrections, not those of the geometry alone [m | rad].
-    """
-
-    corrections: JointCorrections
-    parameters: tuple[str, ...]
-    values: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class SavedKnowledge:
     """What an error model learnt; see ``Knowledge``.
 
@@ -291,12 +274,12 @@ class SavedEstimate:
         status: A key of ``identification.estimate.STATUS``.
         base: (9,) the base's pose, see ``BASE`` [m, rad]; ``None`` if the file does not say.
         targets: (targets, 3) in the tip's frame [m]; ``None`` if the file does not say.
-        noise: The parts of the scatter, or ``None``.
+        noise: Of a point, or ``None``.
         chi_square: Whether measurement noise alone explains the residuals, or ``None``.
         verdict: Whether the calibration is good, or ``None``.
         predicted_accuracy_per_test_pose: (K,) [m]; infinite where it rests on what the data cannot see.
-        joint_corrections: Errors of the joints' transmissions with their geometry, or ``None``.
-        learnt: What an error model learnt, or ``None``.
+        placement_alone: (P,) values of a fit of placement alone [unit]; ``None`` in older files.
+        learnt: What predicts, or ``None`` in older files.
         document: Everything that the file holds, as plain values.
     """
 
@@ -313,11 +296,11 @@ class SavedEstimate:
     status: str
     base: FloatArray | None
     targets: FloatArray | None
-    noise: NoiseLevels | None
+    noise: PointNoise | None
     chi_square: ChiSquare | None
     verdict: Verdict | None
     predicted_accuracy_per_test_pose: FloatArray
-    joint_corrections: SavedCorrections | None
+    placement_alone: FloatArray | None
     learnt: SavedKnowledge | None
     document: dict[str, Any]
 
@@ -337,37 +320,18 @@ class SavedEstimate:
         """What predicts as the estimate did, for the nominal ``robot``.
 
         Raises:
-            InputError: The estimate is of another robot or version of it, or was made without an error model.
+            InputError: The estimate is of another robot or version of it, or holds no error model.
             UnknownNameError: The robot has no parameter of that name.
         """
         self.check_robot(robot)
         saved = self.learnt
         if saved is None:
-            raise InputError("estimate", "no error model", "an estimate by an error model", "identify again")
+            raise InputError("estimate", "no error model", "an estimate that holds one", "identify again")
         placed = replace(_put(robot, saved.base, saved.targets), parameter_names=self.parameters)
         if saved.model.names(placed) != saved.names:
             advice = "give the robot that the estimate was made with"
             raise InputError("estimate.error_model", "coefficients of another robot", "the robot's", advice)
         return Knowledge(placed, saved.model, saved.coefficients, saved.covariance, saved.hidden)
-
-    def complete(self, robot: Robot) -> Robot:
-        """The geometry that belongs with ``joint_corrections``, right at their ``actual``; base and targets too.
-
-        Without corrections it is ``calibrated``.
-
-        Raises:
-            InputError, UnknownNameError: As ``calibrated``.
-        """
-        placed, learnt = self.calibrated(robot), self.joint_corrections
-        if learnt is None:
-            return placed
-        values = dict(zip(learnt.parameters, learnt.values.tolist(), strict=True))
-
-        def moved(e: Element) -> Element:
-            return replace(e, value=values.get(e.parameter or "", e.value))
-
-        branches = tuple(tuple(map(moved, branch)) for branch in placed.targets)
-        return replace(placed, elements=tuple(map(moved, placed.elements)), targets=branches)
 
     def corrected(self, robot: Robot) -> Robot:
         """The nominal ``robot`` with the errors of its own chain; base and targets stay.
@@ -377,7 +341,8 @@ class SavedEstimate:
         """
         self.check_robot(robot)
         names = self.chain_parameters
-        deviations = dict(zip(self.parameters, self.deviations.tolist(), strict=True))
+        values = self.values if self.placement_alone is None else self.placement_alone
+        deviations = dict(zip(self.parameters, (values - self.nominal).tolist(), strict=True))
         return robot.with_deviations({n: deviations[n] for n in names})
 
     def check_robot(self, robot: Robot) -> None:
@@ -428,7 +393,8 @@ def calibrated_robot(robot: Robot, saved: SavedEstimate) -> Robot:
         UnknownNameError: The robot has no parameter of that name.
     """
     targets: dict[tuple[int, int], float] = {}
-    for name, value in zip(saved.parameters, saved.values.tolist(), strict=True):
+    own = saved.values if saved.placement_alone is None else saved.placement_alone
+    for name, value in zip(saved.parameters, own.tolist(), strict=True):
         target = TARGET.fullmatch(name)
         if target:
             targets[int(target[1]) - 1, "xyz".index(target[2])] = value

@@ -21,7 +21,7 @@ import numpy as np
 from calib_planner import __version__
 from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.identification import Estimate, IdentificationProblem, fit_placement, start_robot
+from calib_planner.identification import Estimate, IdentificationProblem, place_nominal
 from calib_planner.io import config_folder, shipped_robots
 from calib_planner.report.scene import Scene, scene_of
 
@@ -183,7 +183,7 @@ def calibration_report(
 
     Args:
         problem: The problem that was solved.
-        estimate: ``identify(problem)``, possibly with ``validate`` and ``cross_validate``.
+        estimate: ``identify(problem)``, possibly with ``validate``.
         provenance: See ``provenance.provenance``; default: versions and date alone.
 
     Raises:
@@ -196,8 +196,6 @@ def calibration_report(
         got = size.format(len(estimate.residuals.vectors), len(estimate.fit.parameters), estimate.calibrated.name)
         valid = size.format(len(data), len(robot.parameter_names), robot.name)
         raise InputError("estimate", got, valid, "give the problem that the estimate answers")
-    used = data.without(estimate.points.rejected)
-    nominal = fit_placement(start_robot(robot, data, robust=problem.loss == "robust"), used)
-    before = np.asarray(data.p - nominal.positions(data.q))
+    before = np.asarray(data.p - place_nominal(problem).positions(data.q))
     scene = scene_of(problem, estimate, before)
     return CalibrationReport(problem, estimate, provenance or Provenance(), before, scene)

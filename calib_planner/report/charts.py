@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, IntArray
-from calib_planner.identification import FEWEST, Estimate, Validation
+from calib_planner.error_model import Poses
+from calib_planner.identification import Estimate, Validation
 from calib_planner.report.calibration import CalibrationReport
 from calib_planner.report.render import Drawing, Shape, shape
 from calib_planner.report.scene import REJECTED, SUSPECT, USED, point_states, thinned
@@ -26,6 +27,8 @@ from calib_planner.units import joint_factor, joint_unit, length
 
 MOST_DOTS = 1200
 BINS = 12
+FEWEST = 10
+"""Different configurations below which means over bins say nothing."""
 SHORT = 0.05
 """Where a joint's lever is shorter than this share of its longest, its motion has no direction to speak of."""
 PARTS = ("along", "axial", "across")
@@ -198,9 +201,8 @@ def accuracy_charts(estimate: Estimate) -> tuple[Drawing, Drawing | None]:
 
 def validation_sets(estimate: Estimate) -> list[tuple[str, str, Validation]]:
     """Name, attribute of the estimate and statistics of each validation there is."""
-    held_out, in_turn = estimate.validation, estimate.cross_validation
-    sets = [("held-out points", "validation", held_out)] if held_out else []
-    return [*sets, (f"left out in turn, {in_turn.folds} folds", "cross_validation", in_turn)] if in_turn else sets
+    held_out = estimate.validation
+    return [("held-out points", "validation", held_out)] if held_out else []
 
 
 def _compared(rows: list[Row], title: str, required: float | None = None) -> Drawing:
@@ -370,17 +372,20 @@ def joint_residuals(report: CalibrationReport) -> FloatArray:
     return parts
 
 
-def correction_charts(report: CalibrationReport) -> list[Drawing]:
-    """φ of each joint over the angles that were measured, if joint corrections were learnt."""
+def joint_function_charts(report: CalibrationReport) -> list[Drawing]:
+    """What each joint turns beyond its reading by its own angle, if joint functions are in the model."""
     e, q = report.estimate, report.problem.data.q
-    if e.transmission is None:
+    model = e.knowledge.model
+    if model.joint_functions is None:
         return []
     grid = np.linspace(q.min(axis=0), q.max(axis=0), 121)
-    phi = 1e3 * e.transmission.corrections.at(grid)
+    place = model.slices(e.knowledge.robot)[model.joint_functions.name]
+    readings = Poses(e.knowledge.placed, grid)
+    phi = 1e3 * model.joint_functions.deflection(readings, e.knowledge.coefficients[place])
     highest = 1.1 * float(np.abs(phi).max()) or 1.0
     charts = []
     for k, turns in enumerate(e.calibrated.joint_is_revolute):
-        chart, shown = _by_joint(e, k, grid, 160, "mrad" if turns else "mm", highest, "joint correction of")
+        chart, shown = _by_joint(e, k, grid, 160, "mrad" if turns else "mm", highest, "joint function of")
         charts.append(chart.drawing(chart.line("mean along", shown, phi[:, k])))
     return charts
 

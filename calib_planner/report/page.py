@@ -14,7 +14,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from calib_planner.identification import SIGNIFICANT, STRONG, Estimate, IdentificationProblem
+from calib_planner.identification import STRONG, Estimate, IdentificationProblem
 from calib_planner.io import URDF_SUFFIXES, write_text
 from calib_planner.report import charts
 from calib_planner.report.calibration import CalibrationReport, Provenance, calibration_report
@@ -71,7 +71,6 @@ def report_page(report: CalibrationReport) -> str:
         sets=[(name, f"estimate.{key}") for name, key, _ in charts.validation_sets(report.estimate)],
         parameters=_parameters(report.estimate),
         placed=any(map(is_nuisance, report.estimate.fit.parameters)),
-        structure=_structure(report.estimate),
         ways=ways_to_apply(report),
         counts={
             "rows": len(report.problem.data),
@@ -80,7 +79,7 @@ def report_page(report: CalibrationReport) -> str:
             "robots": len(report.scene.robot_rows),
             "joint_dots": min(points, charts.MOST_DOTS // 2),
         },
-        corrected=data["estimate"]["joint_corrections"] is not None,
+        systematic=len(report.estimate.knowledge.model.systematic) > 1,
         shown_unit=MILLI_UNIT,
         most_pairs=MOST_PAIRS,
         strong=STRONG,
@@ -146,19 +145,11 @@ def _parameters(e: Estimate) -> list[dict[str, Any]]:
     ]
 
 
-def _structure(e: Estimate) -> list[dict[str, Any]]:
-    """Which trends the residuals show, with the key of each."""
-    return [
-        {"key": f"estimate.structure.{i}", "joint": s.joint, "kind": s.kind, "sure": s.probability < SIGNIFICANT}
-        for i, s in enumerate(e.diagnostics.structure)
-    ]
-
-
 def ways_to_apply(report: CalibrationReport) -> list[tuple[str, str, str]]:
     """How to apply this estimate to this robot: (for which controller, what it does, command to copy)."""
     made = report.provenance
     robot = made.named("robot") or report.problem.robot.source or report.problem.robot.name
-    learnt = report.estimate.transmission is not None
+    learnt = len(report.estimate.knowledge.model.systematic) > 1
     without = " The joint corrections are not in it." if learnt else ""
     if "identify" in made.command:
         again = made.command

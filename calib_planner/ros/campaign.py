@@ -32,7 +32,7 @@ from calib_planner.campaign import (
     Paused,
 )
 from calib_planner.errors import InputError
-from calib_planner.io import write_estimate, write_measurements
+from calib_planner.io import read_error_model, write_estimate, write_measurements
 from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
@@ -71,7 +71,7 @@ def problem_of(settings: CampaignParameters, model: Model | NotReady) -> Campaig
         np.array(settings.test_pose_rows),
         settings.required_accuracy,
         constraints=constraints_of(settings, robot),
-        identification={"joint_corrections": settings.joint_corrections},
+        identification={"error_model": read_error_model(settings.error_model)},
         **{name: getattr(settings, name) for name in SAME},
     )
 

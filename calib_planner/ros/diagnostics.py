@@ -173,7 +173,7 @@ def _estimate(session: Session) -> Finding:
         "residual rms [m]": f"{estimate.residuals.after.rms:.3g}",
         "predicted accuracy [m]": f"{estimate.accuracy.overall:.3g}",
         "verdict": estimate.verdict.level,
-        "seconds": f"{estimate.diagnostics.seconds:.4f}",
+        "seconds": f"{estimate.seconds:.4f}",
     }
     reasons = "; ".join(r.text for r in estimate.verdict.reasons if r.level != "PASS")
     level = OK if estimate.fit.status == "ok" else WARN

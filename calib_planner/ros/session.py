@@ -29,7 +29,7 @@ import numpy as np
 from calib_planner.acquisition import Rejection, Standstill, mean_std
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import CalibPlannerError, InputError, NotEnoughDataError, StoreError, UnknownNameError
-from calib_planner.identification import UPDATE, Estimate, IdentificationProblem, identify
+from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.io import (
     ACCEPTED,
     KEPT,
@@ -291,9 +291,7 @@ class Session:
         poses = self.plan.test_poses if self.plan is not None and len(self.plan.test_poses) else None
         if data is None:
             raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-        # An estimate is made after every standstill: what takes long waits until the plan is complete.
-        quick = dict(UPDATE) | ({"order_check": "auto"} if self.complete else {})
-        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses, **quick)
+        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses)
 
     def estimate(self, how: Matching) -> Estimate | TooFew:
         """Identify with the measurements in use."""

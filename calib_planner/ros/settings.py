@@ -189,9 +189,7 @@ class CampaignParameters(PlanParameters):
         0.5,
     )
     sigma: float = parameter(1e-5, "expected noise of one coordinate of one measurement", "m", 1e-9, 1.0)
-    joint_corrections: str = parameter(
-        "auto", "identify errors of the joints' transmissions where the data show them", choices=("auto", "off")
-    )
+    error_model: str = parameter("typical", "how the robot errs: typical, paper, or the path of a YAML file")
     starts: int = parameter(16, "random starts of the search of a plan", "", 1, 100000)
     seed: int = parameter(0, "seed of the plans", "", 0, LARGEST_SEED)
     store_folder: str = parameter(

@@ -26,7 +26,6 @@ from calib_planner.campaign import (
     Unreachable,
     run_campaign,
 )
-from calib_planner.identification import JointCorrections, phases
 from calib_planner.robot import Robot
 from calib_planner.simulation.cell import (
     NEVER,
@@ -38,6 +37,7 @@ from calib_planner.simulation.cell import (
     independent_seeds,
     random_deviations,
 )
+from calib_planner.simulation.corrections import JointCorrections, phases
 from calib_planner.simulation.motion import Stand
 from calib_planner.tracker import LaserTracker, Noise
 

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 
 from calib_planner.arrays import FloatArray, frozen, plain
-from calib_planner.identification import UPDATE, IdentificationProblem, identify
+from calib_planner.error_model import ErrorModel
+from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.planning import InformationModel, covariance
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations
 from calib_planner.tracker import Isotropic
-
-PLAIN: dict[str, Any] = {**UPDATE, "discrepancy": "off"}
-"""The paper's iteration, eq. (6), and nothing beside it: the noise is known and nothing else errs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +105,7 @@ def calibrate(
     errors = np.empty((laboratory.count, 3))
     for row, seed in enumerate(seeds):
         data = cell.measure(configurations, repetitions, int(seed))
-        estimate = identify(IdentificationProblem(robot, data, sigma, **PLAIN))
+        estimate = identify(IdentificationProblem(robot, data, sigma, ErrorModel.paper()))
         errors[row] = estimate.calibrated.positions(pose)[0, 0] - truth
     spread = error_covariance(robot, configurations, repetitions, pose, sigma)
     mean = float(np.trace(spread))

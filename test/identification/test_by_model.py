@@ -15,7 +15,6 @@ from calib_planner import Estimate, IdentificationProblem, Measurements, Robot, 
 from calib_planner.compensation import compensate
 from calib_planner.error_model import ErrorModel, Knowledge, Prior, typical
 from calib_planner.errors import InputError, NotEnoughDataError
-from calib_planner.identification import cross_validate
 from calib_planner.io import read_error_model, read_estimate, read_measurements, write_estimate
 from calib_planner.io.yaml import read_document, write_document
 
