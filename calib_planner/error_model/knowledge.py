@@ -132,8 +132,7 @@ class Knowledge:
         names = self.robot.parameter_names
         deviations = dict(zip(names, self.coefficients[: len(names)], strict=True))
         robot = self.robot.with_deviations(deviations)
-        readings = Poses(robot, clean, load)
-        return replace(readings, deflection=self.model.deflection(readings, self.coefficients))
+        return self.model.deflected(Poses(robot, clean, load), self.coefficients)
 
     def actual(self, q: ArrayLike) -> FloatArray:
         """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m]."""
