@@ -12,5 +12,6 @@ from calib_planner.error_model.points import Points
 from calib_planner.error_model.poses import Poses
 from calib_planner.error_model.prior import Prior
 from calib_planner.error_model.saved import from_mapping, to_mapping
+from calib_planner.error_model.truth import Truth, VisitErrors
 from calib_planner.error_model.typical import typical, typical_prior, with_tolerances
 from calib_planner.error_model.visits import Visits

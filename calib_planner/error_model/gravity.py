@@ -18,6 +18,7 @@ and play that depends on the moment are in them, so they are not compliances.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -155,19 +156,26 @@ def downwards(robot: Robot, up: ArrayLike) -> tuple[float, float, float]:
 
 def link_points(robot: Robot, q: FloatArray, joint: int | None, xyz: ArrayLike) -> FloatArray:
     """(N, 3) where ``xyz`` (3,) of the link that joint number ``joint`` moves is; ``None``: of the tip [m]."""
-    branch = target_elements(check_array("mass", np.reshape(xyz, (1, 3)), (1, 3)))
+    x, y, z = check_array("mass", xyz, (3,))
+    part = _link(robot, joint, (float(x), float(y), float(z)))
+    return part.positions(q[:, : len(part.joint_names)])[:, 0]
+
+
+@lru_cache(maxsize=64)
+def _link(robot: Robot, joint: int | None, xyz: tuple[float, float, float]) -> Robot:
+    """The robot up to a link, its target being at ``xyz`` of that link; a simulation asks at every sample."""
+    branch = target_elements(np.array([xyz]))
     if joint is None:
-        return replace(robot, targets=branch, parameter_names=()).positions(q)[:, 0]
+        return replace(robot, targets=branch, parameter_names=())
     end = next(i for i, e in enumerate(robot.elements) if e.joint == joint) + 1
     # A joint with an oblique axis is turned back behind its motion; its link is there.
     before, behind = robot.elements[end - 2], robot.elements[end : end + 2]
     if len(behind) == 2 and behind[0] == Element(before.kind, -before.value) and before.value:
         end += 2
-    part = Robot(
+    return Robot(
         name=robot.name,
         elements=robot.elements[:end],
         targets=branch,
         joint_names=robot.joint_names[: joint + 1],
         joint_limits=robot.joint_limits[: joint + 1],
     )
-    return part.positions(q[:, : joint + 1])[:, 0]

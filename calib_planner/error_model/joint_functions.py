@@ -100,6 +100,12 @@ class JointFunctions:
         ]
         return self._spread(robot, np.sum(shares, axis=0))
 
+    def shares(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
+        """Component → (K,) its share of the variance, and so of the mean, of each coefficient."""
+        total = self.variances(robot, values)
+        alone = {c: JointFunctions((c,), self.harmonics).variances(robot, values) for c in self.components}
+        return {c: np.divide(v, total, out=np.zeros(len(total)), where=total > 0.0) for c, v in alone.items()}
+
     def gradients(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (K,) derivative of ``variances`` by its logarithm."""
         result = {}

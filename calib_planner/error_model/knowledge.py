@@ -135,8 +135,7 @@ class Knowledge:
     def poses(self, q: ArrayLike, load: FloatArray | None = None) -> Poses:
         """Configurations (N, joints) with parameters and deflections at their means."""
         clean = check_configurations("configurations", q, self.robot.joint_names)
-        readings = Poses(self.placed, clean, load)
-        return replace(readings, deflection=self.model.deflection(readings, self.coefficients))
+        return self.model.deflected(Poses(self.placed, clean, load), self.coefficients)
 
     def actual(self, q: ArrayLike) -> FloatArray:
         """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m]."""

@@ -120,6 +120,28 @@ class ErrorModel:
         scales = tuple(replace(s, value=values.get(s.name, s.value)) for s in self.scales)
         return replace(self, scales=scales, name=self.name if name is None else name)
 
+    def with_noise(self, noise: Noise | float) -> ErrorModel:
+        """The same with a stated instrument, or σ of every coordinate [m].
+
+        The paper's has nothing but noise, so that a stated one leaves nothing to be estimated.
+        """
+        stated = ErrorModel.paper(noise).points
+        points = stated if self.is_papers else replace(self.points, noise=stated.noise)
+        return replace(self, points=points)
+
+    def with_drawn_scales(self, rng: np.random.Generator) -> ErrorModel:
+        """The same with each scale drawn from its spread, median · factor^N(0, 1).
+
+        A scale that is known stays, and so does one of which nothing is known.
+        """
+        drawn = rng.standard_normal(len(self.scales))
+        spread = {s.name: s.factor if s.factor < NOTHING_KNOWN else 1.0 for s in self.scales}
+        values = {
+            s.name: s.median * spread[s.name] ** float(d) if spread[s.name] > 1.0 else s.value
+            for s, d in zip(self.scales, drawn, strict=True)
+        }
+        return self.with_values(values)
+
     def without(self, term: str) -> ErrorModel:
         """The same without ``gravity``, ``joint_functions``, ``visits`` or one component of the second."""
         if self.joint_functions is not None and term in self.joint_functions.components:
@@ -188,6 +210,10 @@ class ErrorModel:
                 total += term.deflection(poses, coefficients[where[term.name]])
         return total
 
+    def deflected(self, readings: Poses, coefficients: FloatArray) -> Poses:
+        """The same configurations with the deflection of β (coefficients,)."""
+        return replace(readings, deflection=self.deflection(readings, coefficients))
+
     def variances(self, robot: Robot) -> FloatArray:
         """(coefficients,) prior variances, infinite where flat [unit²]; see ``precision`` for M₀."""
         return np.concatenate([term.variances(robot, self.values) for term in self.systematic])
@@ -205,6 +231,16 @@ class ErrorModel:
             places = np.ix_(*[stated.places(robot.parameter_names)] * 2)
             matrix[places] = np.linalg.inv(np.asarray(stated.covariance))
         return matrix
+
+    def draw_coefficients(self, robot: Robot, rng: np.random.Generator) -> FloatArray:
+        """(coefficients,) β drawn from its prior at the scales in force; 0 where the prior is flat [unit]."""
+        variances, stated = self.variances(robot), self.placement.stated
+        drawn = rng.standard_normal(len(variances))
+        beta = np.sqrt(np.where(np.isinf(variances), 0.0, variances)) * drawn
+        if stated is not None:
+            places = stated.places(robot.parameter_names)
+            beta[places] = stated.root @ drawn[places]
+        return self.means(robot) + beta
 
     def gradients(self, robot: Robot) -> dict[str, FloatArray]:
         """Scale → (coefficients,) derivative of ``variances`` by its logarithm, for scales that are not known."""

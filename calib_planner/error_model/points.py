@@ -70,3 +70,20 @@ class Points:
             block = values["floor"] ** 2 * np.eye(3 * targets)
             result["floor"] = np.broadcast_to(block, (len(poses), 3 * targets, 3 * targets))
         return result
+
+    def noise_of(self, points: FloatArray, values: dict[str, float], standard: FloatArray) -> FloatArray:
+        """(…, 3) errors of the instrument at ``points`` (…, 3) [m].
+
+        Args:
+            points: Where the points are [m].
+            values: The scales.
+            standard: (…, 3) errors of covariance I.
+        """
+        if self.noise is None:
+            return np.zeros(points.shape)
+        factor = values.get("instrument", 1.0) * np.linalg.cholesky(self.noise.covariance(points))
+        return np.asarray((factor @ standard[..., None])[..., 0])
+
+    def floor_of(self, values: dict[str, float], standard: FloatArray) -> FloatArray:
+        """(…, 3) errors of the floor [m], from ``standard`` (…, 3) errors of covariance I."""
+        return (values["floor"] if self.floor else 0.0) * standard

@@ -20,6 +20,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model.poses import Poses
+from calib_planner.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -54,3 +55,16 @@ class Visits:
             block = values["shared"] ** 2 * np.kron(np.ones((count, count)), np.eye(3))
             result["shared"] = np.broadcast_to(block, (len(poses), 3 * count, 3 * count))
         return result
+
+    def draw(
+        self, robot: Robot, values: dict[str, float], count: int, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """h (count, joints) in units of ``joint_units``, and s (count, targets, 3) [m], of ``count`` visits.
+
+        Switching one of them off leaves the draws of the other as they are.
+        """
+        targets = len(robot.targets)
+        turned, moved = rng.standard_normal((count, len(robot.joint_names))), rng.standard_normal((count, 1, 3))
+        size = values["shared"] if self.shared and targets > 1 else 0.0
+        shifts = np.broadcast_to(size * moved, (count, targets, 3))
+        return (values["repeatability"] if self.joints else 0.0) * turned, shifts

@@ -105,7 +105,5 @@ def _columns(problem: LinearProblem) -> Iterator[tuple[str, slice, FloatArray]]:
         if not isinstance(term, JointFunctions):
             yield term.name, place, np.ones(term.size(robot))
             continue
-        total = term.variances(robot, model.values)
-        for component in term.components:
-            alone = JointFunctions((component,), term.harmonics).variances(robot, model.values)
-            yield component, place, np.divide(alone, total, out=np.zeros(len(total)), where=total > 0.0)
+        for component, share in term.shares(robot, model.values).items():
+            yield component, place, share
