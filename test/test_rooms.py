@@ -34,21 +34,22 @@ ROOMS: dict[str, str] = {
     "tracker": "robot",
     "error_model": "robot tracker",
     "acquisition": "robot tracker",
-    "planning": "robot tracker",
+    "planning": "robot tracker error_model",
     "identification": "robot tracker error_model planning",
     "compensation": "robot identification",
     "campaign": "robot tracker acquisition planning identification",
     "simulation": "robot tracker acquisition planning identification campaign",
     "io": "robot tracker error_model acquisition planning identification compensation campaign",
     "report": "robot tracker planning identification io",
-    "demo": "robot planning identification simulation io report",
-    "cli": "robot tracker acquisition planning identification compensation campaign simulation io report demo",
+    "demo": "robot error_model planning identification simulation io report",
+    "cli": "robot tracker error_model acquisition planning identification compensation campaign simulation io "
+    "report demo",
     "ros": "robot tracker acquisition planning identification campaign simulation io report demo",
 }
 """Room → the rooms that it may use besides ``GROUND``, in the order of the house: each only rooms above it."""
 FRONT = {"": "doors errors measurements planning identification io", "__main__": "cli"}
 """The package's own door, which resolves names when they are first used, and ``python -m calib_planner``."""
-PAPER_USES = "robot tracker planning identification simulation io report cli"
+PAPER_USES = "robot tracker error_model planning identification simulation io report cli"
 WITHOUT_A_DOOR = ("ros",)
 """A node that starts pays only for what it needs: other programs import the files of this room one by one."""
 
