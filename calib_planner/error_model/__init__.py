@@ -3,7 +3,7 @@
 docs/glossary.md explains the words.
 """
 
-from calib_planner.error_model.gravity import Gravity, Mass, downwards
+from calib_planner.error_model.gravity import LINKS, Gravity, Mass, Payload, downwards, gravity_of
 from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.knowledge import (
     ACCURACIES,

@@ -109,10 +109,13 @@ class Knowledge:
 
     @staticmethod
     def of_plan(
-        robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None, repetitions: int = 1
+        robot: Robot, model: ErrorModel, q: ArrayLike, payload: ArrayLike | None = None, repetitions: int = 1
     ) -> Knowledge:
-        """What measuring ``q`` (N, joints) ``repetitions`` times each will tell; the mean stays at nominal."""
-        matrix = prior_information(robot, model) + repetitions * information(robot, model, q, load).sum(axis=0)
+        """What measuring ``q`` (N, joints) ``repetitions`` times each will tell; the mean stays at nominal.
+
+        ``payload``: as in ``poses``.
+        """
+        matrix = prior_information(robot, model) + repetitions * information(robot, model, q, payload).sum(axis=0)
         return Knowledge.from_information(robot, model, matrix)
 
     @staticmethod
@@ -122,32 +125,41 @@ class Knowledge:
 
     # ── prediction ───────────────────────────────────────────────────────────────────────────────────
 
-    def poses(self, q: ArrayLike, load: FloatArray | None = None) -> Poses:
-        """Configurations (N, joints) with parameters and deflections at their means."""
+    def poses(self, q: ArrayLike, payload: ArrayLike | None = None) -> Poses:
+        """Configurations (N, joints) with parameters and deflections at their means.
+
+        Args:
+            q: (N, joints) readings [rad | m].
+            payload: Mass of the payload, one or (N,) [kg]; ``None``: what the elastic term states.
+        """
         clean = check_configurations("configurations", q, self.robot.joint_names)
         names = self.robot.parameter_names
         deviations = dict(zip(names, self.coefficients[: len(names)], strict=True))
         robot = self.robot.with_deviations(deviations)
-        return self.model.deflected(Poses(robot, clean, load), self.coefficients)
+        readings = Poses(robot, clean, self.model.payloads(payload, len(clean)))
+        return self.model.deflected(readings, self.coefficients)
 
-    def actual(self, q: ArrayLike) -> FloatArray:
-        """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m]."""
-        return self.poses(q).actual
+    def actual(self, q: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
+        """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m].
 
-    def reading(self, actual: ArrayLike) -> FloatArray:
+        ``payload``: as in ``poses``.
+        """
+        return self.poses(q, payload).actual
+
+    def reading(self, actual: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
         """(N, joints) what the joints read when they stand at ``actual`` (N, joints): its inverse."""
         wanted = check_configurations("configurations", actual, self.robot.joint_names)
         q = np.array(wanted)
         for _ in range(50):  # a few milliradians that change slowly: each round gains two digits or more
-            error = wanted - self.actual(q)
+            error = wanted - self.actual(q, payload)
             q = q + error
             if np.abs(error).max(initial=0.0) < 1e-15:
                 break
         return q
 
-    def predict(self, q: ArrayLike, load: FloatArray | None = None) -> Prediction:
-        """Mean and covariance of what would be measured at ``q`` (N, joints) [rad | m]."""
-        poses = self.poses(q, load)
+    def predict(self, q: ArrayLike, payload: ArrayLike | None = None) -> Prediction:
+        """Mean and covariance of what would be measured; arguments as for ``poses``."""
+        poses = self.poses(q, payload)
         n, targets = len(poses), len(self.robot.targets)
         columns = self.model.columns(poses).reshape(n, targets, 3, -1)
         count = len(self.robot.parameter_names)
@@ -175,16 +187,18 @@ class Knowledge:
         self,
         test_poses: ArrayLike,
         kind: str = "world",
-        load: FloatArray | None = None,
+        payload: ArrayLike | None = None,
         weights: ArrayLike | None = None,
     ) -> Accuracy:
         """(M3) at ``test_poses`` (K, joints), the mean over the poses with ``weights`` (K,), equal by default.
+
+        ``payload``: as in ``poses``.
 
         Raises:
             UnknownNameError: ``kind`` is neither ``world`` nor ``robot``.
             InputError: ``robot`` for fewer than four test poses, or for points in a line or a plane.
         """
-        poses = self.poses(test_poses, load)
+        poses = self.poses(test_poses, payload)
         blocks = accuracy_rows(poses.points, self.model.columns(poses), kind)
         per_pose = np.sqrt([error_variance(rows, self.covariance, self.hidden) for rows in blocks])
         share = np.ones(len(poses)) if weights is None else np.asarray(weights, float)
@@ -216,16 +230,22 @@ class Knowledge:
         return Knowledge(robot, self.model, coefficients, covariance, hidden)
 
     def updated(
-        self, q: ArrayLike, points: FloatArray, seen: NDArray[np.bool_] | None = None, rounds: int = 3
+        self,
+        q: ArrayLike,
+        points: FloatArray,
+        seen: NDArray[np.bool_] | None = None,
+        rounds: int = 3,
+        payload: ArrayLike | None = None,
     ) -> Knowledge:
         """With a few more visits ``q`` (N, joints) and their ``points`` (N, targets, 3) [m]; the scales stay.
 
-        Linearised anew ``rounds`` times at the new mean. ``seen`` (N, targets): which points were measured.
+        Linearised anew ``rounds`` times at the new mean. ``seen`` (N, targets): which points were measured;
+        ``payload``: as in ``poses``.
         """
         mean, mask = self.coefficients, np.ones(points.shape[:2], bool) if seen is None else seen
         use = np.repeat(mask, 3, axis=1).ravel()
         for _ in range(rounds):
-            poses = replace(self, coefficients=mean).poses(q)
+            poses = replace(self, coefficients=mean).poses(q, payload)
             columns = self.model.columns(poses)
             rows = columns.reshape(-1, len(mean))[use]
             apart = np.where(mask[:, :, None], points - poses.points, 0.0).ravel()[use]
@@ -243,10 +263,13 @@ def prior_information(robot: Robot, model: ErrorModel) -> FloatArray:
     return model.precision(robot)
 
 
-def information(robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None) -> FloatArray:
-    """J⁺_iᵀ R_i⁻¹ J⁺_i of each configuration (N, joints): (N, coefficients, coefficients)."""
+def information(robot: Robot, model: ErrorModel, q: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
+    """J⁺_iᵀ R_i⁻¹ J⁺_i of each configuration (N, joints): (N, coefficients, coefficients).
+
+    ``payload``: as in ``Knowledge.poses``.
+    """
     clean = check_configurations("configurations", q, robot.joint_names)
-    poses = Poses(robot, clean, load)
+    poses = Poses(robot, clean, model.payloads(payload, len(clean)))
     columns = model.columns(poses)
     white = np.linalg.solve(np.linalg.cholesky(model.visit_covariance(poses)), columns)
     return np.asarray(white.transpose(0, 2, 1) @ white)

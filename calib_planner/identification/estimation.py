@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Knowledge, Poses
+from calib_planner.error_model import ErrorModel, Knowledge, Payload, Poses
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.doubt import (
     LARGEST,
@@ -110,15 +110,14 @@ class _Work:
     Attributes:
         robot: With base and targets about where they are; β are deviations from it.
         data: The visits that take part.
-        load: (N,) payload of each visit as a share of the largest one, or ``None``.
         state: Where it is linearised.
         rounds: Relinearisations made.
         converged: Whether the predictions stood still in the last one.
         shifted: (N, targets) D of the points of a run of visits that is shifted [m²]; 0 for all others.
     """
 
-    def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
-        self.robot, self.data, self.load = robot, data, load
+    def __init__(self, robot: Robot, data: Measurements, model: ErrorModel) -> None:
+        self.robot, self.data = robot, data
         self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
         self.rounds, self.converged = 0, False
         self.shifted = np.zeros(data.seen.shape)
@@ -175,7 +174,7 @@ class _Work:
         """Parameters and deflected joints at β (coefficients,)."""
         names = self.robot.parameter_names
         here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
-        poses = Poses(here, self.data.q, self.load)
+        poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
         return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
 
     def settle(self, most: int, scales: int = 30) -> Solution:
@@ -255,7 +254,6 @@ def fit_error_model(
     data: Measurements,
     model: ErrorModel,
     *,
-    load: FloatArray | None = None,
     robust: bool = True,
     choose: bool = True,
 ) -> ModelEstimate:
@@ -263,9 +261,9 @@ def fit_error_model(
 
     Args:
         robot: Nominal. Base and targets start in closed form if all their parameters are active.
-        data: The measurements; the joint order may differ from the robot's.
+        data: The measurements; the joint order may differ from the robot's. Where they hold payloads and the
+            elastic term knows none, it gets one at the tip.
         model: The terms, with their scales before the data.
-        load: (N,) payload of each visit as a share of the largest one, or ``None``.
         robust: Whether impossible points lose weight; never with the paper's model.
         choose: Whether terms that do not better the left-out score go.
 
@@ -275,21 +273,20 @@ def fit_error_model(
     data = data.in_order_of(robot.joint_names)
     robust, choose = robust and not model.is_papers, choose and not model.is_papers
     try:
-        return _estimate(robot, data, model, load, robust, choose)
+        return _estimate(robot, data, model, robust, choose)
     except np.linalg.LinAlgError:
         need = len(robot.parameter_names)
         message = "the measured configurations do not determine the robot's place: measure more that differ"
         raise NotEnoughDataError(3 * int(data.seen.sum()), need, message) from None
 
 
-def _estimate(
-    robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None, robust: bool, choose: bool
-) -> ModelEstimate:
+def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool) -> ModelEstimate:
     """The same for clean arguments."""
     robot, far = _placed(robot, data)
+    model = _with_gravity_as_stated(model, robot, data)
     some = _some(data)
     part = data if some is None else data.select(some)
-    work = _Work(robot, part, model, load if load is None or some is None else load[some])
+    work = _Work(robot, part, model)
     if robust:
         work.state = replace(work.state, doubt=far if some is None else far[some])
     work.settle(MOST_STARTS, 0)
@@ -304,7 +301,7 @@ def _estimate(
         solution = work.settle(MOST_ROUNDS, 0)
     scales = scale_covariance(solution)
     if some is not None:
-        whole = _Work(robot, data, work.state.model, load)
+        whole = _Work(robot, data, work.state.model)
         near = np.clip(np.searchsorted(some, np.arange(len(data))), 0, len(some) - 1)
         whole.shifted = np.where(data.seen, work.shifted[near].max(axis=1)[:, None], 0.0)
         doubt = np.maximum(far, whole.shifted) if robust else np.zeros(data.seen.shape)
@@ -357,6 +354,17 @@ def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
         if settled:
             break
     return put, np.where(length > FAR * median, OUT * length**2, 0.0)
+
+
+def _with_gravity_as_stated(model: ErrorModel, robot: Robot, data: Measurements) -> ErrorModel:
+    """The model whose elastic term knows how the robot is mounted and what it carried, from base and data."""
+    if model.gravity is None:
+        return model
+    gravity = model.gravity.placed(robot)
+    heaviest = 0.0 if data.payload is None else float(np.asarray(data.payload).max())
+    if heaviest > 0.0 and gravity.payload is None:
+        gravity = gravity.with_payload(Payload(heaviest))
+    return replace(model, gravity=gravity)
 
 
 def _some(data: Measurements) -> FloatArray | None:

@@ -187,7 +187,7 @@ def test_a_visit_that_alone_tells_a_direction_has_no_left_out_residual() -> None
     points = robot.positions(q)
     model = replace(ErrorModel.paper(3e-5), placement=Placement("flat"))
     some = robot.with_parameters("wrist_2_joint.rz,shoulder_pan_joint.rz")
-    work = _Work(some, type(data)(robot.joint_names, q, points), model, None)
+    work = _Work(some, type(data)(robot.joint_names, q, points), model)
     found = left_out(dense(work.linearised()))
     assert np.isfinite(found.scores).all() and found.usable[:5].all()
 
