@@ -38,7 +38,7 @@ ROOMS: dict[str, str] = {
     "identification": "robot tracker error_model planning",
     "compensation": "robot identification",
     "campaign": "robot tracker acquisition planning identification",
-    "simulation": "robot tracker acquisition planning identification campaign",
+    "simulation": "robot tracker error_model acquisition planning identification campaign",
     "io": "robot tracker error_model acquisition planning identification compensation campaign",
     "report": "robot tracker planning identification io",
     "demo": "robot error_model planning identification simulation io report",

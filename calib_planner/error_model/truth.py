@@ -145,15 +145,15 @@ class Truth:
         """The same robot whose joints err by a Fourier series more than they do.
 
         Args:
-            series: (joints, 2, harmonics) cosines and sines of each joint's series, the first harmonic first, in
-                units of ``joint_units``.
+            series: (joints, 2, harmonics) cosines and sines of each joint's series, the first harmonic first
+                [rad | m].
             size: Its root mean square [rad], the scale of a model that had no joint functions.
         """
         model, joints = self.model, len(self.robot.joint_names)
         old = model.joint_functions
         count = max(series.shape[2], 0 if old is None else old.harmonics)
         total = np.zeros((joints, 2, count))
-        total[:, :, : series.shape[2]] = series
+        total[:, :, : series.shape[2]] = series / joint_units(self.robot)[:, None, None]
         names, where = self.robot.parameter_names, model.slices(self.robot)
         if old is not None:
             own = self.coefficients[where["joint_functions"]].reshape(joints, 2, old.harmonics)

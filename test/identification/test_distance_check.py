@@ -109,7 +109,7 @@ def test_a_target_seated_elsewhere_that_passes_for_a_discrepancy(seed: int) -> N
     cell = SimulatedCell(nominal, random_deviations(nominal, seed), SIGMA / 4)
     data = bare(cell.measure(ROUND, 2, seed))
     raw = np.random.default_rng(seed).standard_normal(3)
-    seat = cell.truth.target_offsets + 3e-4 * raw / np.linalg.norm(raw)
+    seat = cell.truth.robot.target_offsets + 3e-4 * raw / np.linalg.norm(raw)
     moved = np.where(
         np.arange(24)[:, None, None] < 12,
         0.0,
