@@ -225,8 +225,7 @@ def limited(found: Estimate, truth: dict[str, float], world: World) -> bool:
 
 def error_at_pose(found: Estimate, world: World) -> float:
     """Distance between the true target and the prediction at ``POSE``, over the predicted accuracy there."""
-    actual = world.transmission.actual(POSE) if world.faults.transmission_error else POSE
-    error = world.cell.truth.positions(actual) - found.positions(POSE)
+    error = world.truth.positions(POSE) - found.positions(POSE)
     return float(np.linalg.norm(error) / found.accuracy.overall)
 
 

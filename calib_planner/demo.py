@@ -18,10 +18,11 @@ from rich.console import Console
 from rich.table import Table
 
 from calib_planner.arrays import FloatArray, plain
+from calib_planner.error_model import covariance, error_variance
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.io import make_folder, write_estimate, write_measurements, write_plan, write_text
-from calib_planner.planning import Callback, InformationModel, Plan, PlanProblem, Search, error_variance, plan
+from calib_planner.planning import Callback, InformationModel, Plan, PlanProblem, Search, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, independent_seeds, random_deviations
@@ -219,7 +220,8 @@ def _random_plans(problem: PlanProblem, cell: SimulatedCell, seed: int, count: i
     for _ in range(count):
         q = rng.uniform(low, high, (problem.configurations, len(low)))
         matrix = model.at(q).sum(axis=0)
-        variances = [error_variance(j, matrix) for j in robot.jacobian(poses)]
+        known = covariance(matrix)
+        variances = [error_variance(j, *known) for j in robot.jacobian(poses)]
         predicted.append(np.sqrt(weights @ np.array(variances)))
         data = cell.measure(q, problem.repetitions, int(rng.integers(2**31)))
         estimate = identify(IdentificationProblem(robot, data, sigma=sigma))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,12 +46,14 @@ class Measurements:
         configurations: (N, joints) [rad | m].
         points: (N, targets, 3) in the tracker's frame [m]; NaN where a target was not measured.
         std: (N, targets, 3) standard deviation of each coordinate [m], or ``None`` where unknown.
+        payload: (N,) mass that the robot carried at each visit [kg], or ``None`` where nobody stated one.
     """
 
     joint_names: tuple[str, ...]
     configurations: ArrayLike
     points: ArrayLike
     std: ArrayLike | None = None
+    payload: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -72,6 +74,11 @@ class Measurements:
             if (std[~np.isnan(points)] <= 0).any() or np.isnan(std[~np.isnan(points)]).any():
                 raise InputError("std", "a value <= 0 or missing", "a standard deviation > 0 [m]")
             put(self, "std", std)
+        if self.payload is not None:
+            payload = check_array("payload", self.payload, (len(q),), meaning="mass at each configuration in kg")
+            if (payload < 0).any():
+                raise InputError("payload", f"{payload.min():g} kg", "masses of 0 kg or more")
+            put(self, "payload", payload)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -94,15 +101,15 @@ class Measurements:
     def select(self, rows: ArrayLike) -> Measurements:
         """Some of the rows, in the order given."""
         rows = np.asarray(rows)
-        std = None if self.std is None else np.asarray(self.std)[rows]
-        return Measurements(self.joint_names, self.q[rows], self.p[rows], std)
+        std, payload = (None if a is None else np.asarray(a)[rows] for a in (self.std, self.payload))
+        return Measurements(self.joint_names, self.q[rows], self.p[rows], std, payload)
 
     def without(self, rejected: Iterable[RejectedPoint]) -> Measurements:
         """The same rows with the rejected points marked as not measured."""
         points = np.array(self.p)
         for point in rejected:
             points[point.row, point.target - 1] = np.nan
-        return Measurements(self.joint_names, self.q, points, self.std)
+        return replace(self, points=points)
 
     def in_order_of(self, joint_names: Sequence[str]) -> Measurements:
         """The same with the joint columns in another order.
@@ -113,7 +120,7 @@ class Measurements:
         if set(joint_names) != set(self.joint_names):
             raise InputError("joint names", ", ".join(self.joint_names), f"the robot's: {', '.join(joint_names)}")
         order = [self.joint_names.index(n) for n in joint_names]
-        return Measurements(tuple(joint_names), self.q[:, order], self.p, self.std)
+        return replace(self, joint_names=tuple(joint_names), configurations=self.q[:, order])
 
 
 def configuration_labels(q: FloatArray) -> IntArray:

@@ -42,7 +42,8 @@ ROOMS: dict[str, str] = {
     "io": "robot tracker error_model acquisition planning identification compensation campaign",
     "report": "robot tracker error_model planning identification io",
     "demo": "robot error_model planning identification simulation io report",
-    "cli": "robot tracker error_model acquisition planning identification compensation campaign simulation io report demo",
+    "cli": "robot tracker error_model acquisition planning identification compensation campaign simulation io "
+    "report demo",
     "ros": "robot tracker error_model acquisition planning identification campaign simulation io report demo",
 }
 """Room → the rooms that it may use besides ``GROUND``, in the order of the house: each only rooms above it."""

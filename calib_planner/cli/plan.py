@@ -32,7 +32,7 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.sheet import tell_sheet
 from calib_planner.cli.terminal import Terminal, configurations_table
-from calib_planner.error_model import typical_prior
+from calib_planner.error_model import ACCURACIES, typical_prior
 from calib_planner.errors import InputError
 from calib_planner.io import (
     make_folder,
@@ -172,6 +172,9 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     wanted = parser.add_argument_group("where accuracy matters")
     add_test_poses(wanted, "where accuracy matters")
     add_test_path(wanted)
+    text = "what an accuracy is: the error in the frame of the points, or the same up to a rigid motion of the "
+    text += "base, for a robot that is registered anew"
+    option(wanted, "--accuracy-frame", None, text, "world", choices=ACCURACIES)
     option(wanted, "--weights", '"w1 …"', "weight of each test pose (equal)", kind=numbers)
     if any_criterion:
         _add_criteria(wanted)
@@ -228,6 +231,7 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         weights=args.weights,
         **conditions(args, robot),
         criterion=criterion,
+        accuracy_frame=args.accuracy_frame,
         compound=compound,
         repeatability=args.configuration_sigma,
         discrepancy=discrepancy,

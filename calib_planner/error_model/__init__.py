@@ -3,9 +3,17 @@
 docs/glossary.md explains the words.
 """
 
-from calib_planner.error_model.gravity import Gravity, Mass, downwards
+from calib_planner.error_model.gravity import LINKS, Gravity, Mass, Payload, downwards, gravity_of
 from calib_planner.error_model.joint_functions import JointFunctions
-from calib_planner.error_model.knowledge import ACCURACIES, Knowledge, without_rigid_motion
+from calib_planner.error_model.knowledge import (
+    ACCURACIES,
+    FELT,
+    Knowledge,
+    accuracy_rows,
+    covariance,
+    error_variance,
+    without_rigid_motion,
+)
 from calib_planner.error_model.model import ErrorModel, Scale
 from calib_planner.error_model.placement import Placement
 from calib_planner.error_model.points import Points

@@ -40,6 +40,8 @@ from calib_planner.robot import Robot
 ACCURACIES = ("world", "robot")
 ROUNDING = 1e-13
 """Eigenvalues of the information, scaled to unit diagonal, below this are zero."""
+FELT = 1e-6
+"""A test pose feels a hidden direction that moves it by more than this share of what moves it most."""
 FLATTEST = 1e-3
 """Test poses whose points are thinner than this share of their extent lie in a plane."""
 UNKNOWN = 1.0
@@ -107,22 +109,19 @@ class Knowledge:
 
     @staticmethod
     def of_plan(
-        robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None, repetitions: int = 1
+        robot: Robot, model: ErrorModel, q: ArrayLike, payload: ArrayLike | None = None, repetitions: int = 1
     ) -> Knowledge:
-        """What measuring ``q`` (N, joints) ``repetitions`` times each will tell; the mean stays at nominal."""
-        matrix = prior_information(robot, model) + repetitions * information(robot, model, q, load).sum(axis=0)
+        """What measuring ``q`` (N, joints) ``repetitions`` times each will tell; the mean stays at nominal.
+
+        ``payload``: as in ``poses``.
+        """
+        matrix = prior_information(robot, model) + repetitions * information(robot, model, q, payload).sum(axis=0)
         return Knowledge.from_information(robot, model, matrix)
 
     @staticmethod
     def from_information(robot: Robot, model: ErrorModel, matrix: FloatArray) -> Knowledge:
         """The inverse of M on the space that it shows; ``matrix`` (coefficients, coefficients)."""
-        diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        scale = np.where(diagonal > 0.0, diagonal, 1.0)
-        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-        shown = values > ROUNDING * max(float(values[-1]), 1e-300)
-        half = vectors[:, shown] / np.sqrt(values[shown]) / scale[:, None]
-        hidden = vectors[:, ~shown] / scale[:, None]
-        return Knowledge(robot, model, np.zeros(len(matrix)), half @ half.T, hidden)
+        return Knowledge(robot, model, np.zeros(len(matrix)), *covariance(matrix))
 
     @property
     def placed(self) -> Robot:
@@ -132,29 +131,38 @@ class Knowledge:
 
     # ── prediction ───────────────────────────────────────────────────────────────────────────────────
 
-    def poses(self, q: ArrayLike, load: FloatArray | None = None) -> Poses:
-        """Configurations (N, joints) with parameters and deflections at their means."""
+    def poses(self, q: ArrayLike, payload: ArrayLike | None = None) -> Poses:
+        """Configurations (N, joints) with parameters and deflections at their means.
+
+        Args:
+            q: (N, joints) readings [rad | m].
+            payload: Mass of the payload, one or (N,) [kg]; ``None``: what the elastic term states.
+        """
         clean = check_configurations("configurations", q, self.robot.joint_names)
-        return self.model.deflected(Poses(self.placed, clean, load), self.coefficients)
+        readings = Poses(self.placed, clean, self.model.payloads(payload, len(clean)))
+        return self.model.deflected(readings, self.coefficients)
 
-    def actual(self, q: ArrayLike) -> FloatArray:
-        """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m]."""
-        return self.poses(q).actual
+    def actual(self, q: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
+        """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m].
 
-    def reading(self, actual: ArrayLike) -> FloatArray:
+        ``payload``: as in ``poses``.
+        """
+        return self.poses(q, payload).actual
+
+    def reading(self, actual: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
         """(N, joints) what the joints read when they stand at ``actual`` (N, joints): its inverse."""
         wanted = check_configurations("configurations", actual, self.robot.joint_names)
         q = np.array(wanted)
         for _ in range(50):  # a few milliradians that change slowly: each round gains two digits or more
-            error = wanted - self.actual(q)
+            error = wanted - self.actual(q, payload)
             q = q + error
             if np.abs(error).max(initial=0.0) < 1e-15:
                 break
         return q
 
-    def predict(self, q: ArrayLike, load: FloatArray | None = None) -> Prediction:
-        """Mean and covariance of what would be measured at ``q`` (N, joints) [rad | m]."""
-        poses = self.poses(q, load)
+    def predict(self, q: ArrayLike, payload: ArrayLike | None = None) -> Prediction:
+        """Mean and covariance of what would be measured; arguments as for ``poses``."""
+        poses = self.poses(q, payload)
         n, targets = len(poses), len(self.robot.targets)
         columns = self.model.columns(poses).reshape(n, targets, 3, -1)
         count = len(self.robot.parameter_names)
@@ -178,28 +186,28 @@ class Knowledge:
 
     # ── accuracy ─────────────────────────────────────────────────────────────────────────────────────
 
-    def accuracy(self, test_poses: ArrayLike, kind: str = "world", load: FloatArray | None = None) -> Accuracy:
-        """(M3) at ``test_poses`` (K, joints).
+    def accuracy(
+        self,
+        test_poses: ArrayLike,
+        kind: str = "world",
+        payload: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+    ) -> Accuracy:
+        """(M3) at ``test_poses`` (K, joints), the mean over the poses with ``weights`` (K,), equal by default.
+
+        ``payload``: as in ``poses``.
 
         Raises:
             UnknownNameError: ``kind`` is neither ``world`` nor ``robot``.
             InputError: ``robot`` for fewer than four test poses, or for points in a line or a plane.
         """
-        if kind not in ACCURACIES:
-            raise UnknownNameError("accuracy", kind, ACCURACIES)
-        poses = self.poses(test_poses, load)
-        rows = self.model.columns(poses).reshape(-1, len(self.coefficients))
-        values, vectors = np.linalg.eigh(self.covariance)
-        half = rows @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-        unseen = rows @ self.hidden
-        if kind == "robot":
-            half, unseen = (without_rigid_motion(poses.points, part) for part in (half, unseen))
-        squares = np.sum(half**2, axis=1).reshape(len(poses), -1)
-        if unseen.size:
-            felt = np.abs(unseen).max(axis=1) > 1e-6 * np.abs(rows).max() * np.abs(self.hidden).max()
-            squares[felt.reshape(squares.shape)] = np.inf
-        per_pose = np.sqrt(squares.sum(axis=1) / len(self.robot.targets))
-        return Accuracy(kind, float(np.sqrt(np.mean(per_pose**2))), per_pose)
+        poses = self.poses(test_poses, payload)
+        blocks = accuracy_rows(poses.points, self.model.columns(poses), kind)
+        per_pose = np.sqrt([error_variance(rows, self.covariance, self.hidden) for rows in blocks])
+        share = np.ones(len(poses)) if weights is None else np.asarray(weights, float)
+        counted = share > 0.0
+        mean = float(share[counted] @ per_pose[counted] ** 2 / share.sum()) if len(poses) else np.nan
+        return Accuracy(kind, float(np.sqrt(mean)), per_pose)
 
     # ── a few more points ────────────────────────────────────────────────────────────────────────────
 
@@ -225,16 +233,22 @@ class Knowledge:
         return Knowledge(robot, self.model, coefficients, covariance, hidden)
 
     def updated(
-        self, q: ArrayLike, points: FloatArray, seen: NDArray[np.bool_] | None = None, rounds: int = 3
+        self,
+        q: ArrayLike,
+        points: FloatArray,
+        seen: NDArray[np.bool_] | None = None,
+        rounds: int = 3,
+        payload: ArrayLike | None = None,
     ) -> Knowledge:
         """With a few more visits ``q`` (N, joints) and their ``points`` (N, targets, 3) [m]; the scales stay.
 
-        Linearised anew ``rounds`` times at the new mean. ``seen`` (N, targets): which points were measured.
+        Linearised anew ``rounds`` times at the new mean. ``seen`` (N, targets): which points were measured;
+        ``payload``: as in ``poses``.
         """
         mean, mask = self.coefficients, np.ones(points.shape[:2], bool) if seen is None else seen
         use = np.repeat(mask, 3, axis=1).ravel()
         for _ in range(rounds):
-            poses = replace(self, coefficients=mean).poses(q)
+            poses = replace(self, coefficients=mean).poses(q, payload)
             columns = self.model.columns(poses)
             rows = columns.reshape(-1, len(mean))[use]
             apart = np.where(mask[:, :, None], points - poses.points, 0.0).ravel()[use]
@@ -252,13 +266,69 @@ def prior_information(robot: Robot, model: ErrorModel) -> FloatArray:
     return model.precision(robot)
 
 
-def information(robot: Robot, model: ErrorModel, q: ArrayLike, load: FloatArray | None = None) -> FloatArray:
-    """J⁺_iᵀ R_i⁻¹ J⁺_i of each configuration (N, joints): (N, coefficients, coefficients)."""
+def information(robot: Robot, model: ErrorModel, q: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
+    """J⁺_iᵀ R_i⁻¹ J⁺_i of each configuration (N, joints): (N, coefficients, coefficients).
+
+    ``payload``: as in ``Knowledge.poses``.
+    """
     clean = check_configurations("configurations", q, robot.joint_names)
-    poses = Poses(robot, clean, load)
+    poses = Poses(robot, clean, model.payloads(payload, len(clean)))
     columns = model.columns(poses)
     white = np.linalg.solve(np.linalg.cholesky(model.visit_covariance(poses)), columns)
     return np.asarray(white.transpose(0, 2, 1) @ white)
+
+
+def covariance(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse of an information matrix on the space that it shows, and a basis of the rest.
+
+    Scaled to unit diagonal first, so that the rank does not depend on the units of the coefficients.
+
+    Returns:
+        (p, p) pseudo-inverse C, and (p, p − rank) hidden directions (unit columns).
+    """
+    diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(diagonal > 0, diagonal, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    shown = values > ROUNDING * max(float(values[-1]), 1e-300)
+    basis = vectors[:, shown] / scale[:, None]
+    hidden = vectors[:, ~shown] / scale[:, None]
+    if hidden.size:
+        hidden = hidden / np.linalg.norm(hidden, axis=0)
+    return (basis / values[shown]) @ basis.T, hidden
+
+
+def accuracy_rows(points: FloatArray, columns: FloatArray, kind: str) -> FloatArray:
+    """(K, 3·targets, p) the rows of (M3): J⁺_0, for ``robot`` without what a rigid motion explains.
+
+    Args:
+        points: (K, targets, 3) at the test poses [m].
+        columns: (K, 3·targets, p) J⁺_0.
+        kind: ``world`` or ``robot``.
+
+    Raises:
+        UnknownNameError: Another kind.
+        InputError: See ``without_rigid_motion``.
+    """
+    if kind not in ACCURACIES:
+        raise UnknownNameError("accuracy_frame", kind, ACCURACIES)
+    if kind == "world":
+        return columns
+    flat = without_rigid_motion(points, columns.reshape(-1, columns.shape[2]))
+    return flat.reshape(columns.shape)
+
+
+def error_variance(rows: FloatArray, inverse: FloatArray, hidden: FloatArray) -> float:
+    """ρ0² of (M3) for the rows (3·targets, p) of one test pose [m²]: the mean over its targets.
+
+    Infinite if the pose feels a direction that nothing shows.
+
+    Args:
+        rows: From ``accuracy_rows``.
+        inverse: (p, p) C, and ``hidden`` (p, directions): from ``covariance``.
+    """
+    if hidden.size and np.abs(rows @ hidden).max() > FELT * np.abs(rows).max():
+        return float("inf")
+    return max(float(np.einsum("ij,jk,ik->", rows, inverse, rows)), 0.0) / (len(rows) / 3)
 
 
 def without_rigid_motion(points: FloatArray, rows: FloatArray) -> FloatArray:

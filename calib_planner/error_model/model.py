@@ -18,8 +18,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from calib_planner.arrays import FloatArray, check_number
+from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.error_model.gravity import Gravity
 from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.placement import Placement
@@ -190,6 +191,28 @@ class ErrorModel:
             result[term.name] = slice(start, end)
             start = end
         return result
+
+    def payloads(self, payload: ArrayLike | None, count: int) -> FloatArray | None:
+        """(count,) mass of the payload at each of ``count`` visits [kg], as ``Poses`` wants it.
+
+        Args:
+            payload: One for all or one for each visit [kg]; ``None``: what the elastic term states.
+
+        Raises:
+            InputError: A mass below zero, or a payload where the elastic term knows none.
+        """
+        if payload is None or self.gravity is None:
+            return None
+        given = np.asarray(payload, float)
+        masses = check_array("payload", np.full(count, given) if given.ndim == 0 else given, (count,))
+        if (masses < 0.0).any():
+            raise InputError("payload", f"{masses.min():g} kg", "masses of 0 kg or more")
+        if self.gravity.payload is None:
+            if not masses.any():
+                return None
+            advice = "identify with --payload, or with a column payload in the measurements"
+            raise InputError("payload", f"{masses.max():g} kg", "none: the error model knows no payload", advice)
+        return masses
 
     # ── columns and priors ───────────────────────────────────────────────────────────────────────────
 

@@ -26,13 +26,13 @@ class Poses:
     Attributes:
         robot: Its active parameters, base and targets are those in force.
         q: (N, joints) readings of the joints [rad | m].
-        load: (N,) payload of each visit as a share of the largest one; ``None``: the same at every visit.
+        payload: (N,) mass of the payload at each visit [kg]; ``None``: what the error model states.
         deflection: (N, joints) δ, or ``None`` for none; in units of ``joint_units``.
     """
 
     robot: Robot
     q: FloatArray
-    load: FloatArray | None = None
+    payload: FloatArray | None = None
     deflection: FloatArray | None = None
 
     def __len__(self) -> int:

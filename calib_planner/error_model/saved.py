@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.error_model.gravity import Gravity, Mass
+from calib_planner.error_model.gravity import Gravity, Mass, Payload
 from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.model import ErrorModel, Scale
 from calib_planner.error_model.placement import Placement
@@ -22,6 +22,7 @@ from calib_planner.error_model.visits import Visits
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.tracker import Isotropic, LaserTracker, Noise
 
+GRAVITY = {f.name for f in fields(Gravity)}
 NOISES = {"isotropic": Isotropic, "laser_tracker": LaserTracker}
 
 
@@ -58,7 +59,7 @@ def from_mapping(data: Mapping[str, Any], field: str = "error_model") -> ErrorMo
         placement = _section(field, data, "placement", {"prior", "stated"})
         points = dict(_section(field, data, "points", {"noise", "estimate_scale", "floor"}))
         noise = None if points.get("noise") is None else _noise(f"{field}.points.noise", points["noise"])
-        gravity = _optional(field, data, "gravity", {"masses", "mounting"})
+        gravity = _optional(field, data, "gravity", GRAVITY, GRAVITY - {"payload", "vertical"})
         functions = _optional(field, data, "joint_functions", {"components", "harmonics"})
         visits = _optional(field, data, "visits", {"joints", "shared"})
         return ErrorModel(
@@ -96,8 +97,12 @@ def _gravity(field: str, data: Mapping[str, Any]) -> Gravity:
     for k, mass in enumerate(data["masses"]):
         _check_keys(f"{field}.masses[{k}]", mass, {"name", "joint", "xyz", "weight"}, {"name"})
         masses.append(Mass(**{**mass, "xyz": tuple(mass.get("xyz", (0.0, 0.0, 0.0)))}))
-    mounting = data["mounting"]
-    return Gravity(tuple(masses), mounting if isinstance(mounting, str) else tuple(mounting))
+    mounting, payload, vertical = data["mounting"], data.get("payload"), data.get("vertical")
+    if payload is not None:
+        _check_keys(f"{field}.payload", payload, {"mass", "xyz"}, {"mass", "xyz"})
+        payload = Payload(payload["mass"], tuple(payload["xyz"]))
+    mounting = mounting if isinstance(mounting, str) else tuple(mounting)
+    return Gravity(tuple(masses), mounting, payload, None if vertical is None else tuple(vertical))
 
 
 def _noise(field: str, data: Mapping[str, Any]) -> Noise:
@@ -121,8 +126,13 @@ def _section(field: str, data: Mapping[str, Any], key: str, known: set[str]) -> 
     return dict(data[key])
 
 
-def _optional(field: str, data: Mapping[str, Any], key: str, known: set[str]) -> Mapping[str, Any] | None:
-    return None if data[key] is None else _section(field, data, key, known)
+def _optional(
+    field: str, data: Mapping[str, Any], key: str, known: set[str], needed: set[str] | None = None
+) -> Mapping[str, Any] | None:
+    if data[key] is None:
+        return None
+    _check_keys(f"{field}.{key}", data[key], known, known if needed is None else needed)
+    return dict(data[key])
 
 
 def _check_keys(field: str, data: object, known: set[str], needed: set[str]) -> None:

@@ -88,25 +88,26 @@ class Truth:
     # ── what is where ────────────────────────────────────────────────────────────────────────────────
 
     def actual(
-        self, q: ArrayLike, visits: VisitErrors | None = None, load: FloatArray | None = None
+        self, q: ArrayLike, visits: VisitErrors | None = None, payload: ArrayLike | None = None
     ) -> FloatArray:
         """(N, joints) where the joints stand when they read ``q`` (N, joints) [rad | m].
 
         Args:
             visits: Errors of the N visits; default: where they stand on average.
-            load: (N,) payload of each visit as a share of the largest one.
+            payload: Mass of the payload, one or (N,) [kg]; default: what the elastic term states.
         """
         clean = check_configurations("configurations", q, self.robot.joint_names)
-        poses = self.model.deflected(Poses(self.robot, clean, load), self.coefficients)
+        readings = Poses(self.robot, clean, self.model.payloads(payload, len(clean)))
+        poses = self.model.deflected(readings, self.coefficients)
         if visits is None:
             return poses.actual
         return np.asarray(poses.actual + visits.joints * joint_units(self.robot))
 
     def positions(
-        self, q: ArrayLike, visits: VisitErrors | None = None, load: FloatArray | None = None
+        self, q: ArrayLike, visits: VisitErrors | None = None, payload: ArrayLike | None = None
     ) -> FloatArray:
         """(N, targets, 3) where the targets are when the joints read ``q`` (N, joints) [m]; see ``actual``."""
-        points = self.robot.positions(self.actual(q, visits, load))
+        points = self.robot.positions(self.actual(q, visits, payload))
         return points if visits is None else points + visits.points
 
     # ── what is measured ─────────────────────────────────────────────────────────────────────────────
@@ -126,9 +127,9 @@ class Truth:
         """
         return self.model.points.noise_of(points, self.model.values, standard)
 
-    def measure(self, q: ArrayLike, rng: np.random.Generator, load: FloatArray | None = None) -> FloatArray:
+    def measure(self, q: ArrayLike, rng: np.random.Generator, payload: ArrayLike | None = None) -> FloatArray:
         """(N, targets, 3) points measured at N visits ``q`` (N, joints), each once [m]."""
-        points = self.positions(q, self.draw_visits(len(np.asarray(q)), rng), load)
+        points = self.positions(q, self.draw_visits(len(np.asarray(q)), rng), payload)
         return points + self.noise(points, rng.standard_normal(points.shape))
 
     # ── another truth ────────────────────────────────────────────────────────────────────────────────
@@ -144,15 +145,15 @@ class Truth:
         """The same robot whose joints err by a Fourier series more than they do.
 
         Args:
-            series: (joints, 2, harmonics) cosines and sines of each joint's series, the first harmonic first, in
-                units of ``joint_units``.
+            series: (joints, 2, harmonics) cosines and sines of each joint's series, the first harmonic first
+                [rad | m].
             size: Its root mean square [rad], the scale of a model that had no joint functions.
         """
         model, joints = self.model, len(self.robot.joint_names)
         old = model.joint_functions
         count = max(series.shape[2], 0 if old is None else old.harmonics)
         total = np.zeros((joints, 2, count))
-        total[:, :, : series.shape[2]] = series
+        total[:, :, : series.shape[2]] = series / joint_units(self.robot)[:, None, None]
         names, where = self.robot.parameter_names, model.slices(self.robot)
         if old is not None:
             own = self.coefficients[where["joint_functions"]].reshape(joints, 2, old.harmonics)

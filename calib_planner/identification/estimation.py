@@ -11,16 +11,22 @@
                   found is done with all of them.
 
 The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
+
+An estimate of most of the same measurements is a *start* (``fit_error_model``): its scales and terms are kept,
+and the few visits that came or went are brought in by (4), doubts included. The full fit is made all the same
+where that would not be good enough (``_updated``). What a full fit says depends on the data alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Knowledge, Poses
+from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.error_model import ErrorModel, Knowledge, Payload, Poses
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.doubt import (
     LARGEST,
@@ -35,15 +41,17 @@ from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import (
     LinearProblem,
     Solution,
+    exchange,
     maximise,
     scale_covariance,
     solve,
+    updatable,
     with_uncertain_scales,
 )
 from calib_planner.identification.registration import place, tip_poses
 from calib_planner.identification.term_gain import TermGain, term_gains
 from calib_planner.measurements import Measurements
-from calib_planner.robot import Robot
+from calib_planner.robot import BASE_PARAMETERS, Robot, target_parameters
 from calib_planner.tracker import Isotropic
 
 MOST_STARTS = 20
@@ -66,8 +74,18 @@ LEAST = 1e-8
 """Predictions that move by less than this stand still [m]."""
 STILL = 1e-3
 """Predictions that move by less than this share of a point's standard deviation stand still."""
+FALLS = 0.1
+"""Changes that fall at least by this factor from one relinearisation to the next go on falling."""
 ENOUGH = 450
 """Coordinates from which scales and terms are decided; more visits than that do not take part."""
+GROWN = 2.0
+"""Times as many visits as the scales come from: by then their standard deviations could be a third less."""
+OFF = 1.25
+"""Squared left-out residuals, over what is predicted, that change by this factor show that the scales are off."""
+BASE_ELEMENTS = 9
+"""The first elements of a robot place its base (``Robot.with_base``)."""
+BENDS = 1e-2
+"""Share of a point's standard deviation that kinematics and linearisation may differ by: it is not seen."""
 OPTIONAL = ("short", "smooth", "gravity")
 """Terms that have to better the left-out score."""
 
@@ -84,6 +102,7 @@ class ModelEstimate:
         solution: The last linear problem and its solution.
         rounds: Relinearisations made.
         converged: Whether the predictions stood still at the end.
+        origin: What an update goes on from.
     """
 
     knowledge: Knowledge
@@ -93,6 +112,32 @@ class ModelEstimate:
     solution: Solution
     rounds: int
     converged: bool
+    origin: Origin
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What an estimate was made from, for an update of it.
+
+    Attributes:
+        asked: The model before scales were estimated and terms went.
+        data: The measurements, joints in the robot's order.
+        robust: Whether impossible points lose weight.
+        shifted: (N, targets) D of the points of a run of visits that is shifted [m²].
+        coefficients: (coefficients,) β of the fit.
+        scales: Names of the scales that were estimated, and the covariance of their logarithms.
+        visits: How many visits the last full fit had.
+        surprise: Sum of the squared left-out residuals over its expectation at the last full fit.
+    """
+
+    asked: ErrorModel
+    data: Measurements
+    robust: bool
+    shifted: FloatArray
+    coefficients: FloatArray
+    scales: tuple[tuple[str, ...], FloatArray]
+    visits: int
+    surprise: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +155,17 @@ class _Work:
     Attributes:
         robot: With base and targets about where they are; β are deviations from it.
         data: The visits that take part.
-        load: (N,) payload of each visit as a share of the largest one, or ``None``.
         state: Where it is linearised.
         rounds: Relinearisations made.
-        converged: Whether the predictions stood still in the last one.
+        converged: Whether the predictions stand still after the last one.
+        moved: How far they moved in the last one, as a multiple of what stands still.
         shifted: (N, targets) D of the points of a run of visits that is shifted [m²]; 0 for all others.
     """
 
-    def __init__(self, robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None) -> None:
-        self.robot, self.data, self.load = robot, data, load
+    def __init__(self, robot: Robot, data: Measurements, model: ErrorModel) -> None:
+        self.robot, self.data = robot, data
         self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
-        self.rounds, self.converged = 0, False
+        self.rounds, self.converged, self.moved = 0, False, 0.0
         self.shifted = np.zeros(data.seen.shape)
 
     def linearised(self) -> LinearProblem:
@@ -161,7 +206,10 @@ class _Work:
         std = np.sqrt(np.diagonal(problem.covariance, axis1=1, axis2=2))
         self.state = replace(self.state, coefficients=old + step, model=problem.model)
         self.rounds += 1
-        self.converged = bool((change <= STILL * std + LEAST).all())
+        # In units of what stands still; the next change falls as this one fell beside the one before, or faster.
+        share = float((change / (STILL * std + LEAST)).max())
+        self.converged = share <= 1.0 or bool(share < FALLS * self.moved and share**2 <= self.moved)
+        self.moved = share
         return self.converged or not step.any()
 
     def _cost(self, problem: LinearProblem, coefficients: FloatArray) -> float:
@@ -175,11 +223,23 @@ class _Work:
         """Parameters and deflected joints at β (coefficients,)."""
         names = self.robot.parameter_names
         here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
-        poses = Poses(here, self.data.q, self.load)
+        poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
         return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
+
+    def bends(self, solution: Solution) -> bool:
+        """Whether the kinematics leave other residuals at the state than the linear problem does."""
+        problem = solution.problem
+        straight = (problem.covariance @ solution.weighted[:, :, None])[:, :, 0] * problem.seen
+        apart = np.where(
+            self.data.seen[:, :, None], self.data.p - self._poses(self.state.coefficients).points, 0.0
+        )
+        usual = problem.covariance - problem.parts.get("doubt", 0.0)
+        allowed = BENDS * np.sqrt(np.diagonal(usual, axis1=1, axis2=2)) + LEAST
+        return bool((np.abs(straight - apart.reshape(straight.shape)) > allowed).any())
 
     def settle(self, most: int, scales: int = 30) -> Solution:
         """Relinearise until the predictions stand still; ``scales``: rounds for the scales each time."""
+        self.moved = 0.0
         for _ in range(most):
             problem = self.linearised()
             solution = maximise(problem, scales) if scales else solve(problem)
@@ -255,41 +315,47 @@ def fit_error_model(
     data: Measurements,
     model: ErrorModel,
     *,
-    load: FloatArray | None = None,
     robust: bool = True,
     choose: bool = True,
+    start: ModelEstimate | None = None,
 ) -> ModelEstimate:
     """Identify the active parameters of ``robot`` and all else that the model has.
 
     Args:
         robot: Nominal. Base and targets start in closed form if all their parameters are active.
-        data: The measurements; the joint order may differ from the robot's.
+        data: The measurements; the joint order may differ from the robot's. Where they hold payloads and the
+            elastic term knows none, it gets one at the tip.
         model: The terms, with their scales before the data.
-        load: (N,) payload of each visit as a share of the largest one, or ``None``.
         robust: Whether impossible points lose weight; never with the paper's model.
         choose: Whether terms that do not better the left-out score go.
+        start: An estimate of the same robot and model from most of these data, to be brought up to date: quick,
+            with its scales and terms. A full fit is made where ``start`` does not do, see ``_updated``.
 
     Raises:
         NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
     """
     data = data.in_order_of(robot.joint_names)
     robust, choose = robust and not model.is_papers, choose and not model.is_papers
+    quick = None
+    if start is not None:
+        with suppress(np.linalg.LinAlgError):
+            quick = _updated(robot, data, model, robust, start)
     try:
-        return _estimate(robot, data, model, load, robust, choose)
+        return _estimate(robot, data, model, robust, choose) if quick is None else quick
     except np.linalg.LinAlgError:
         need = len(robot.parameter_names)
         message = "the measured configurations do not determine the robot's place: measure more that differ"
         raise NotEnoughDataError(3 * int(data.seen.sum()), need, message) from None
 
 
-def _estimate(
-    robot: Robot, data: Measurements, model: ErrorModel, load: FloatArray | None, robust: bool, choose: bool
-) -> ModelEstimate:
+def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool) -> ModelEstimate:
     """The same for clean arguments."""
+    asked = model
     robot, far = _placed(robot, data)
+    model = _with_gravity_as_stated(model, robot, data)
     some = _some(data)
     part = data if some is None else data.select(some)
-    work = _Work(robot, part, model, load if load is None or some is None else load[some])
+    work = _Work(robot, part, model)
     if robust:
         work.state = replace(work.state, doubt=far if some is None else far[some])
     work.settle(MOST_STARTS, 0)
@@ -304,7 +370,7 @@ def _estimate(
         solution = work.settle(MOST_ROUNDS, 0)
     scales = scale_covariance(solution)
     if some is not None:
-        whole = _Work(robot, data, work.state.model, load)
+        whole = _Work(robot, data, work.state.model)
         near = np.clip(np.searchsorted(some, np.arange(len(data))), 0, len(some) - 1)
         whole.shifted = np.where(data.seen, work.shifted[near].max(axis=1)[:, None], 0.0)
         doubt = np.maximum(far, whole.shifted) if robust else np.zeros(data.seen.shape)
@@ -314,23 +380,199 @@ def _estimate(
         if robust:
             solution = whole.reconsider(solution, 2, 0)
         work = whole
-    hidden, covariance = _hidden(solution.problem), with_uncertain_scales(solution, scales)
-    covariance = 0.5 * (covariance + covariance.T)  # rounding
-    told = work.state.model
-    if data.std is not None and told.points.noise is None:
-        # What was said of these points is what is expected of others.
-        usual = Isotropic(float(np.sqrt(np.mean(np.asarray(data.std)[data.seen] ** 2))))
-        told = replace(told, points=replace(told.points, noise=usual))
-    known = Knowledge(robot, told, work.state.coefficients, covariance, hidden)
+    covariance = _covariance(solution, scales)
+    left = left_out(solution)
     return ModelEstimate(
-        knowledge=known,
-        left_out=left_out(solution),
+        knowledge=_knowledge(work, covariance, _hidden(solution.problem)),
+        left_out=left,
         doubt=work.state.doubt,
         terms=term_gains(model, solution.problem, work.state.coefficients, covariance, gains),
         solution=solution,
         rounds=work.rounds,
         converged=work.converged,
+        origin=Origin(
+            asked,
+            data,
+            robust,
+            work.shifted,
+            work.state.coefficients,
+            scales,
+            len(data),
+            _surprise(left),
+        ),
     )
+
+
+def _covariance(solution: Solution, scales: tuple[tuple[str, ...], FloatArray]) -> FloatArray:
+    """(coefficients, coefficients) C of β, uncertain scales included, symmetric in all digits."""
+    covariance = with_uncertain_scales(solution, scales)
+    return 0.5 * (covariance + covariance.T)
+
+
+def _knowledge(work: _Work, covariance: FloatArray, hidden: FloatArray) -> Knowledge:
+    """What the state says."""
+    told, data = work.state.model, work.data
+    if data.std is not None and told.points.noise is None:
+        # What was said of these points is what is expected of others.
+        usual = Isotropic(float(np.sqrt(np.mean(np.asarray(data.std)[data.seen] ** 2))))
+        told = replace(told, points=replace(told.points, noise=usual))
+    return Knowledge(work.robot, told, work.state.coefficients, covariance, hidden)
+
+
+def _surprise(left: LeftOut) -> float:
+    """Sum of the squared left-out residuals of visits without doubts over its expectation; 1: there are none."""
+    sound = ~left.doubted.any(axis=1)
+    freedom = float(left.freedom[sound].sum())
+    return float(left.squares[sound].sum()) / freedom if freedom > 0.0 else 1.0
+
+
+# ── an update ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _updated(
+    robot: Robot,
+    data: Measurements,
+    model: ErrorModel,
+    robust: bool,
+    start: ModelEstimate,
+) -> ModelEstimate | None:
+    """``start`` brought up to date with the visits that came and went; ``None``: a full fit is needed.
+
+    That is so if ``start`` is of another robot or model, did not converge or left a direction hidden; if it has
+    no terms with scales (the paper's model: a full fit is as quick); if there are ``GROWN`` times as many visits
+    as the scales come from, or most of these went; if the squared left-out residuals changed by a factor of
+    ``OFF``; or if a visit that went was the only one to tell something.
+    """
+    origin, old = start.origin, start.solution.problem
+    placed = old.robot
+    if not _same_robot(robot, placed) or repr(model) != repr(origin.asked) or robust != origin.robust:
+        return None
+    if model.is_papers or not start.converged or old.basis.shape[0] > old.basis.shape[1]:
+        return None
+    rows = _common(origin.data, data)
+    stays = rows >= 0
+    if len(data) > GROWN * origin.visits or stays.sum() < origin.visits / GROWN:
+        return None
+    work = _Work(placed, data, old.model)
+    flat = old.flat
+    reference = origin.coefficients[flat] - start.solution.coefficients[flat]
+    doubt = np.zeros(data.seen.shape)
+    doubt[stays] = start.doubt[rows[stays]]
+    work.shifted[stays] = origin.shifted[rows[stays]]
+    if len(origin.data) and not stays.all() and stays.any():
+        # A visit behind a shifted run belongs to it.
+        near = np.maximum.accumulate(np.where(stays, np.arange(len(data)), -1))
+        late = ~stays & (near >= 0)
+        work.shifted[late] = np.where(data.seen[late], work.shifted[near[late]].max(axis=1)[:, None], 0.0)
+        doubt = np.maximum(doubt, work.shifted)
+    work.state = _State(origin.coefficients, old.model, doubt)
+    fresh = np.flatnonzero(~stays)
+    new = _Work(placed, data.select(fresh), old.model)
+    new.state = replace(work.state, doubt=np.zeros((len(fresh), doubt.shape[1])))
+    more = new.linearised() if len(fresh) else None
+    if more is not None:
+        away = origin.coefficients[flat] - reference
+        more = replace(more, y=more.y + more.columns[:, :, flat] @ away)
+    problem = _joined(old, more, rows, doubt)
+    solution = exchange(updatable(start.solution), problem, rows)
+    for _ in range(MOST_DOUBTS if robust else 0):
+        changed = np.maximum(impossible(solution, doubt), work.shifted)
+        if ((changed > 0) == (doubt > 0)).all() and (changed <= 2.0 * doubt).all():
+            break
+        doubt = changed
+        problem = replace(problem, parts=_with_doubt(problem.parts, doubt))
+        problem.__dict__["flat"], problem.__dict__["random"] = old.flat, old.random
+        solution = exchange(solution, problem, np.arange(len(data)))
+    coefficients = solution.coefficients.copy()
+    coefficients[flat] += reference
+    coefficients[old.random] += old.means
+    work.state = _State(coefficients, old.model, doubt)
+    work.rounds, work.converged = 1, True
+    final: Solution = solution
+    if work.bends(solution):
+        final = work.settle(2, 0)
+        work.rounds += 1
+    left = left_out(final)
+    surprise = _surprise(left)
+    if not origin.surprise / OFF < surprise < origin.surprise * OFF:
+        return None
+    return ModelEstimate(
+        knowledge=_knowledge(work, _covariance(final, origin.scales), np.zeros((len(coefficients), 0))),
+        left_out=left,
+        doubt=doubt,
+        terms=start.terms,
+        solution=final,
+        rounds=work.rounds,
+        converged=work.converged,
+        origin=replace(origin, data=data, shifted=work.shifted, coefficients=work.state.coefficients),
+    )
+
+
+def _same_robot(robot: Robot, placed: Robot) -> bool:
+    """Whether ``placed`` is ``robot`` with its unknown base and targets somewhere else."""
+    base, tool = _unknown_places(robot)
+    alike = (robot.parameter_names, robot.joint_names) == (placed.parameter_names, placed.joint_names)
+    skip = BASE_ELEMENTS if base else 0
+    alike = alike and robot.elements[skip:] == placed.elements[skip:]
+    return alike and (len(robot.targets) == len(placed.targets) if tool else robot.targets == placed.targets)
+
+
+def _unknown_places(robot: Robot) -> tuple[bool, bool]:
+    """Whether base and targets are unknown altogether, and start in closed form."""
+    active = set(robot.parameter_names)
+    return active.issuperset(BASE_PARAMETERS), active.issuperset(target_parameters(len(robot.targets)))
+
+
+def _common(old: Measurements, new: Measurements) -> IntArray:
+    """(N,) number of each visit of ``new`` among the old ones, −1 where it is not there."""
+
+    def keys(some: Measurements) -> list[bytes]:
+        columns = [some.q, some.p, *(np.asarray(c) for c in (some.std, some.payload) if c is not None)]
+        whole = np.hstack([c.reshape(len(some), -1) for c in columns])
+        return [row.tobytes() for row in whole]
+
+    there: dict[bytes, list[int]] = {}
+    for i, key in reversed(list(enumerate(keys(old)))):
+        there.setdefault(key, []).append(i)
+    return np.array([there[k].pop() if there.get(k) else -1 for k in keys(new)], int)
+
+
+def _joined(old: LinearProblem, new: LinearProblem | None, rows: IntArray, doubt: FloatArray) -> LinearProblem:
+    """The visits ``rows`` of the old problem, and where these are −1 the new one's, with doubts D."""
+    stays = rows >= 0
+
+    def join(one: FloatArray, other: FloatArray | None) -> FloatArray:
+        result = np.empty((len(rows), *one.shape[1:]))
+        result[stays] = one[rows[stays]]
+        if other is not None:
+            result[~stays] = other
+        return result
+
+    parts = {
+        n: join(p, None if new is None else new.parts[n])
+        for n, p in old.parts.items()
+        if n != "doubt" and (new is None or n in new.parts)
+    }
+    problem = LinearProblem(
+        old.robot,
+        old.model,
+        join(old.y, None if new is None else new.y),
+        join(old.columns, None if new is None else new.columns),
+        _with_doubt(parts, doubt),
+        join(old.seen, None if new is None else new.seen),
+    )
+    for name in ("flat", "random", "root", "ratios"):
+        problem.__dict__[name] = getattr(old, name)
+    return problem
+
+
+def _with_doubt(parts: Mapping[str, FloatArray], doubt: FloatArray) -> dict[str, FloatArray]:
+    """The parts of R_i with D (N, targets) in place of what they had."""
+    result = {n: p for n, p in parts.items() if n != "doubt"}
+    return result | {"doubt": part_of(doubt)} if doubt.any() else result
+
+
+# ── the parts of a full fit ──────────────────────────────────────────────────────────────────────────
 
 
 def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
@@ -340,9 +582,7 @@ def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
     are wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the
     start.
     """
-    active = robot.parameter_names
-    base = all(f"base.{a}" in active for a in ("x", "y", "z", "rx", "ry", "rz"))
-    tool = all(f"target_{t + 1}.{a}" in active for t in range(len(robot.targets)) for a in "xyz")
+    base, tool = _unknown_places(robot)
     weights, seen = data.seen.astype(float), data.seen
     poses = tip_poses(robot, data.q, at_base=base) if base or tool else None
     for _ in range(CAUCHY_ROUNDS if poses else 1):
@@ -357,6 +597,17 @@ def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
         if settled:
             break
     return put, np.where(length > FAR * median, OUT * length**2, 0.0)
+
+
+def _with_gravity_as_stated(model: ErrorModel, robot: Robot, data: Measurements) -> ErrorModel:
+    """The model whose elastic term knows how the robot is mounted and what it carried, from base and data."""
+    if model.gravity is None:
+        return model
+    gravity = model.gravity.placed(robot)
+    heaviest = 0.0 if data.payload is None else float(np.asarray(data.payload).max())
+    if heaviest > 0.0 and gravity.payload is None:
+        gravity = gravity.with_payload(Payload(heaviest))
+    return replace(model, gravity=gravity)
 
 
 def _some(data: Measurements) -> FloatArray | None:

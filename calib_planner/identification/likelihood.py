@@ -21,6 +21,13 @@ vanishes, and R is regular because its scales have priors. Flat columns enter as
 span, so that redundant ones do no harm: β_flat = Z γ with the shortest solution. Coordinates that were not
 measured are rows of zeros with variance one; they change nothing.
 
+At the same scales a few visits that come, go or count less change A by Uᵀ Δ U only: U are their rows of W, and Δ
+has the blocks R_i⁻¹ of those that came, −R_i⁻¹ of those that went and the difference of the others. Then
+
+    A'⁻¹ = A⁻¹ − A⁻¹Uᵀ X U A⁻¹ ,     X = (I + Δ U A⁻¹ Uᵀ)⁻¹ Δ ,                                               (4)
+
+and the blocks of P follow from W_i A'⁻¹ W_iᵀ, for the price of a few products with a vector (``exchange``).
+
 The scales are the maximum of L times their log-normal priors (``maximise``), by Newton steps with the average
 information f_aᵀ P f_b, f_a = ∂_a V P y (Gilmour, Thompson & Cullis 1995), in the logarithms of the scales.
 """
@@ -46,6 +53,8 @@ SMALLEST, LARGEST = 5e-3, 300.0
 """Shares of its median between which a scale stays: smaller is none, and larger ones are gross errors' doing."""
 UNBOUNDED = 1e9
 """The same where nothing is known of a scale; a factor from which on this is so."""
+ROUNDED_OFF = 1e-9
+"""Share of the information in a direction below which what is left of it is rounding."""
 SETTLED = 0.02
 """A step that promises less than this of −2 log L ends the search."""
 
@@ -140,10 +149,14 @@ class LinearProblem:
     @cached_property
     def scaled_columns(self) -> FloatArray:
         """(N·m, K) B Λ^½."""
-        result = self.random_columns * self.root
+        return self.scaled(self.random_columns)
+
+    def scaled(self, columns: FloatArray) -> FloatArray:
+        """Columns (…, K) of B, times Λ^½."""
+        result = columns * self.root
         if self.stated is not None:
             places, root = self.stated
-            result[:, places] = self.random_columns[:, places] @ root
+            result[..., places] = columns[..., places] @ root
         return result
 
     @cached_property
@@ -271,6 +284,35 @@ class CoefficientSolution(Solution):
         return np.asarray(self.half @ self.half.T)
 
 
+@dataclass(frozen=True, eq=False)
+class UpdatedSolution(Solution):
+    """By (3), kept so that (4) can change it.
+
+    ``rows`` (N·m, rank + K) is W, ``precision`` (N, m, m) R_i⁻¹, ``inverse`` (rank + K, rank + K) A⁻¹,
+    ``log_determinant`` log|A| and ``spread`` (N, m, m) W_i A⁻¹ W_iᵀ.
+    """
+
+    rows: FloatArray
+    precision: FloatArray
+    inverse: FloatArray
+    log_determinant: float
+    spread: FloatArray
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        turned = self._times(vectors)
+        return turned - self._times(self.rows @ (self.inverse @ (self.rows.T @ turned)))
+
+    def _times(self, vectors: FloatArray) -> FloatArray:
+        n, m = self.problem.y.shape
+        return np.asarray((self.precision @ vectors.reshape(n, m, -1)).reshape(n * m, -1))
+
+    def _reduced(self, vectors: FloatArray) -> FloatArray:
+        return np.asarray(self.inverse @ (self.rows.T @ self._times(vectors)))
+
+    def _reduced_covariance(self) -> FloatArray:
+        return self.inverse
+
+
 def solve(problem: LinearProblem) -> Solution:
     """The cheaper of both forms."""
     coordinates, coefficients = problem.y.size, problem.columns.shape[2]
@@ -342,6 +384,117 @@ def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
     )
 
 
+def updatable(solution: Solution) -> UpdatedSolution:
+    """The same solution in the form that ``exchange`` changes."""
+    if isinstance(solution, UpdatedSolution):
+        return solution
+    problem = solution.problem
+    n, m = problem.y.shape
+    rows = np.hstack([problem.flat_columns, problem.scaled_columns])
+    precision = np.asarray(np.linalg.inv(problem.covariance), np.float64)
+    normal = rows.T @ (precision @ rows.reshape(n, m, -1)).reshape(n * m, -1)
+    rank = problem.flat_columns.shape[1]
+    normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
+    inverse = _inverse(normal)
+    spread = (rows @ inverse).reshape(n, m, -1) @ rows.reshape(n, m, -1).transpose(0, 2, 1)
+    scale = np.sqrt(np.diag(normal))
+    logarithm = 2.0 * np.log(scale).sum() + float(np.linalg.slogdet(normal / np.outer(scale, scale))[1])
+    return _finished(problem, rows, precision, inverse, logarithm, spread)
+
+
+def exchange(solution: UpdatedSolution, problem: LinearProblem, old: IntArray) -> UpdatedSolution:
+    """The solution of ``problem``, which differs from the one solved by a few visits, by (4).
+
+    Args:
+        solution: Of the problem before, at the same scales.
+        problem: The visits wanted; those that stay have the same columns, and may have another R_i.
+        old: (N,) number of each visit in the problem before, −1 where it is new.
+
+    Raises:
+        numpy.linalg.LinAlgError: A visit that went had been the only one to tell a direction.
+    """
+    before = solution.problem
+    (n, m), stays = problem.y.shape, old >= 0
+    gone = np.setdiff1d(np.arange(len(before.y)), old[stays])
+    if np.array_equal(old, np.arange(len(before.y))):
+        rows = solution.rows
+    else:
+        new = problem.columns[~stays]
+        joined = np.empty((n, m, solution.rows.shape[1]))
+        joined[stays] = solution.rows.reshape(len(before.y), m, -1)[old[stays]]
+        flat = new[:, :, problem.flat] @ before.basis
+        joined[~stays] = np.concatenate([flat, problem.scaled(new[:, :, problem.random])], axis=2)
+        rows = joined.reshape(n * m, -1)
+    problem.__dict__["basis"] = before.basis
+    problem.__dict__["flat_columns"] = rows[:, : before.basis.shape[1]]
+    problem.__dict__["scaled_columns"] = rows[:, before.basis.shape[1] :]
+    precision = np.zeros((n, m, m))
+    precision[stays] = solution.precision[old[stays]]
+    other = ~stays
+    other[stays] = (problem.covariance[stays] != before.covariance[old[stays]]).any(axis=(1, 2))
+    precision[other] = np.linalg.inv(problem.covariance[other])
+    changed, was = np.flatnonzero(other), np.where(stays, old, 0)
+    blocks = precision[changed] - stays[changed, None, None] * solution.precision[was[changed]]
+    blocks = np.concatenate([blocks, -solution.precision[gone]])
+    theirs = np.concatenate(
+        [rows.reshape(n, m, -1)[changed], solution.rows.reshape(len(before.y), m, -1)[gone]]
+    ).reshape(len(blocks) * m, rows.shape[1])
+    carried = solution.inverse @ theirs.T
+    middle = np.eye(len(theirs)) + _blocks_times(blocks, theirs @ carried)
+    shares = np.linalg.eigvals(middle).real  # of the information in each direction that is left
+    if not shares.min(initial=1.0) > ROUNDED_OFF:
+        raise np.linalg.LinAlgError("a visit that went had been the only one to tell a direction")
+    inner = np.linalg.solve(middle, _blocks_times(blocks, np.eye(len(theirs))))
+    inner = 0.5 * (inner + inner.T)
+    inverse = solution.inverse - carried @ inner @ carried.T
+    spread = np.zeros((n, m, m))
+    spread[stays] = solution.spread[old[stays]]
+    moved = (rows @ carried).reshape(n, m, -1)
+    spread -= moved @ inner @ moved.transpose(0, 2, 1)
+    own = rows.reshape(n, m, -1)[~stays]
+    spread[~stays] = (own @ inverse) @ own.transpose(0, 2, 1)
+    return _finished(
+        problem, rows, precision, inverse, solution.log_determinant + float(np.log(shares).sum()), spread
+    )
+
+
+def _blocks_times(blocks: FloatArray, matrix: FloatArray) -> FloatArray:
+    """blockdiag(blocks (n, m, m)) · matrix (n·m, k)."""
+    n, m, _ = blocks.shape
+    return np.asarray((blocks @ matrix.reshape(n, m, matrix.shape[1])).reshape(matrix.shape))
+
+
+def _finished(
+    problem: LinearProblem,
+    rows: FloatArray,
+    precision: FloatArray,
+    inverse: FloatArray,
+    logarithm: float,
+    spread: FloatArray,
+) -> UpdatedSolution:
+    """The solution from A⁻¹ ``inverse``, log|A| ``logarithm`` and the other parts of ``UpdatedSolution``."""
+    (n, m), rank = problem.y.shape, problem.basis.shape[1]
+    right = (precision @ problem.y[:, :, None])[:, :, 0]
+    solution = inverse @ (rows.T @ right.ravel())
+    rest = problem.y - (rows @ solution).reshape(n, m)
+    weighted = (precision @ rest[:, :, None])[:, :, 0]
+    value = logarithm - float(np.linalg.slogdet(precision)[1].sum()) + float(np.sum(problem.y * weighted))
+    return UpdatedSolution(
+        problem,
+        value,
+        problem.expand(solution),
+        weighted,
+        precision - precision @ spread @ precision,
+        1.0 - np.diag(inverse)[rank:],
+        solution[rank:],
+        rows,
+        precision,
+        inverse,
+        logarithm,
+        spread,
+    )
+
+
 def _inverse(matrix: FloatArray) -> FloatArray:
     """Of a positive definite matrix, scaled to unit diagonal first."""
     if not len(matrix):
@@ -370,19 +523,27 @@ def penalty(model: ErrorModel, names: tuple[str, ...]) -> tuple[float, FloatArra
 
 def derivatives(solution: Solution, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
     """Gradient of −2 log L by the logarithms of the scales, and its average information (scales, scales)."""
-    problem = solution.problem
-    gradient, pushes = np.zeros(len(names)), np.zeros((problem.y.size, len(names)))
+    problem, pushes = solution.problem, _pushes(solution, names)
+    gradient = np.zeros(len(names))
     for at, name in enumerate(names):
         if name in problem.parts:
-            part = 2.0 * problem.parts[name]
-            push = (part @ solution.weighted[:, :, None])[:, :, 0]
-            gradient[at] += np.sum(part * solution.blocks) - np.sum(push * solution.weighted)
-            pushes[:, at] += push.ravel()
-        ratio = problem.ratios.get(name)
-        if ratio is not None:
-            gradient[at] += ratio @ (solution.squares - solution.pulls**2)
-            pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
+            gradient[at] += 2.0 * np.sum(problem.parts[name] * solution.blocks)
+            push = problem.parts[name] @ solution.weighted[:, :, None]
+            gradient[at] -= 2.0 * np.sum(push[:, :, 0] * solution.weighted)
+        if name in problem.ratios:
+            gradient[at] += problem.ratios[name] @ (solution.squares - solution.pulls**2)
     return gradient, pushes.T @ solution.project(pushes)
+
+
+def _pushes(solution: Solution, names: tuple[str, ...]) -> FloatArray:
+    """(N·m, scales) ∂V P y by the logarithm of each scale."""
+    problem, nothing = solution.problem, np.zeros(len(solution.pulls))
+    ratios = np.stack([problem.ratios.get(n, nothing) for n in names], axis=1)
+    pushes = problem.scaled_columns @ (ratios * solution.pulls[:, None])
+    for at, name in enumerate(names):
+        if name in problem.parts:
+            pushes[:, at] += 2.0 * (problem.parts[name] @ solution.weighted[:, :, None]).ravel()
+    return pushes
 
 
 def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], FloatArray]) -> FloatArray:
@@ -399,15 +560,11 @@ def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], Flo
     result = solution.posterior()
     if not names:
         return result
-    pushes, direct = np.zeros((problem.y.size, len(names))), np.zeros((len(result), len(names)))
+    direct = np.zeros((len(result), len(names)))
     for at, name in enumerate(names):
-        if name in problem.parts:
-            pushes[:, at] += 2.0 * (problem.parts[name] @ solution.weighted[:, :, None]).ravel()
-        ratio = problem.ratios.get(name)
-        if ratio is not None:
-            pushes[:, at] += problem.scaled_columns @ (ratio * solution.pulls)
-            direct[problem.random, at] = ratio * solution.coefficients[problem.random]
-    gradient = direct - solution.coefficients_of(pushes)
+        if name in problem.ratios:
+            direct[problem.random, at] = problem.ratios[name] * solution.coefficients[problem.random]
+    gradient = direct - solution.coefficients_of(_pushes(solution, names))
     return np.asarray(result + gradient @ covariance @ gradient.T)
 
 

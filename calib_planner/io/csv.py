@@ -43,6 +43,8 @@ LINE_END = re.compile(r"\r\n|\r|\n")
 CONFIGURATIONS = "a CSV of joint configurations"
 MEASUREMENTS = "a CSV of measurements"
 REPETITIONS = "repetitions"
+PAYLOAD = "payload"
+"""Column of the mass that the robot carried [kg]."""
 COORDINATE = re.compile(r"(std_)?([xyz])([1-9][0-9]{0,3})")
 NEARLY = re.compile(r"(std|sigma)?[_ ]*[xyz][_ ]*[0-9]*", re.IGNORECASE)
 
@@ -305,13 +307,14 @@ def read_measurements(path: str | Path, robot: Robot, *, degrees: bool = False) 
     count = _target_count(table, others)
     points = _coordinates(table, count, "")
     std = _deviations(table, others, points)
-    known = {*robot.joint_names, *_names(count, ""), *_names(count, "std_")}
+    payload = _payload(table, robot)
+    known = {*robot.joint_names, *_names(count, ""), *_names(count, "std_"), PAYLOAD}
     ignored = tuple(c for c in table.columns if c not in known)
     for name in ignored:
         if NEARLY.fullmatch(name):
             valid = f"{listed(_names(count, ''))} and std_ of each"
             raise FileFormatError(path, f"column {brief(name, 40)}", "an unknown name", valid, "rename it")
-    return MeasurementFile(Measurements(robot.joint_names, q, points, std), ignored, table.lines)
+    return MeasurementFile(Measurements(robot.joint_names, q, points, std, payload), ignored, table.lines)
 
 
 def write_measurements(path: str | Path, data: Measurements, field: str = "output") -> None:
@@ -328,6 +331,9 @@ def measurements_text(data: Measurements) -> str:
         std = np.where(data.seen[:, :, None], np.asarray(data.std), np.nan)
         blocks.append(std.reshape(n, -1))
         columns += _names(count, "std_")
+    if data.payload is not None and PAYLOAD not in data.joint_names:
+        blocks.append(np.asarray(data.payload)[:, None])
+        columns.append(PAYLOAD)
     return format_table(columns, np.hstack(blocks).tolist())
 
 
@@ -364,3 +370,13 @@ def _deviations(table: Table, columns: list[str], points: FloatArray) -> FloatAr
         got = "an empty cell" if np.isnan(std[i, t, a]) else repr(float(std[i, t, a]))
         raise table.error(int(i), f"std_{'xyz'[a]}{t + 1}", got, "a standard deviation > 0 [m]")
     return std
+
+
+def _payload(table: Table, robot: Robot) -> FloatArray | None:
+    """(rows,) masses [kg], or ``None`` if the file has none."""
+    if PAYLOAD not in table.columns or PAYLOAD in robot.joint_names:
+        return None
+    masses = table.numbers([PAYLOAD])[:, 0]
+    for i in np.flatnonzero(masses < 0.0):
+        raise table.error(int(i), PAYLOAD, f"{masses[i]:g}", "a mass of 0 kg or more")
+    return masses

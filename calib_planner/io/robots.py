@@ -13,6 +13,8 @@ A robot YAML holds the chain of eq. (2) element by element:
     lengths: [l1]                 # the parameters of the level "lengths"
     offsets: [dq1]                # the parameters of the level "offsets"
     levels: {elbow: [l1, dq2]}    # optional, further levels
+    masses:                       # optional: what a joint carries; mass [kg], centre of gravity [m]
+      - {joint: q2, mass: 4.2, xyz: [0.4, 0, 0.05]}
 
 In place of ``elements``, a table, standard (``dh``) or modified (``modified_dh``), see ``robot.dh_elements``:
 
@@ -25,6 +27,8 @@ In place of ``elements``, a table, standard (``dh``) or modified (``modified_dh`
 
 A table brings its own ``lengths`` and ``offsets``, unless they are given, and the level ``dh``. Six placement
 errors ``<joint>.x … <joint>.rz`` in front of every joint are added to either; they make up the level ``full``.
+A centre of gravity is in the frame right behind the joint's motion, or for a table in the frame of its row, as
+makers of robots publish it.
 """
 
 from __future__ import annotations
@@ -43,12 +47,14 @@ from calib_planner.robot import (
     ROW_TYPES,
     DhRow,
     Element,
+    LinkMass,
     Robot,
     check_joint_names,
     dh_elements,
     dh_levels,
     pose_elements,
     register_file_reader,
+    rotation,
     target_elements,
 )
 
@@ -56,10 +62,11 @@ URDF_SUFFIXES = (".urdf", ".xml", ".xacro", ".sdf")
 """Files that are read as URDF; what is another format after all is told so by its content."""
 YAML_SUFFIXES = (".yaml", ".yml")
 CHAINS = ("elements", "dh", "modified_dh")
-KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", "lengths", "offsets", "levels")
+KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", "lengths", "offsets", "levels", "masses")
 ELEMENT_KEYS = ("type", "value", "joint", "sign", "parameter")
 TABLE_KEYS = ("rows", "length_unit", "angle_unit")
 ROW_KEYS = ("joint", "type", "theta", "d", "a", "alpha", "sign")
+MASS_KEYS = ("joint", "mass", "xyz")
 JOINT_KEYS = ("name", "lower", "upper", "unit")
 ANGLES = {"rad": 1.0, "deg": np.pi / 180.0}
 LENGTHS = {"m": 1.0, "mm": 1e-3}
@@ -127,6 +134,8 @@ def _robot(top: Node) -> Robot:
     names = tuple(joint["name"].name() for joint in joints)
     check_joint_names(top.path, names)
     chain, levels = _chain(top, names)
+    given = top["masses"].items() if "masses" in top else []
+    masses = tuple(_mass(node, names, chain, "elements" in top) for node in given)
     chain = [*_base(top.get("base", {})), *_with_placement_errors(chain, names)]
     full = tuple(f"{names[e.joint]}.{x}" for e in chain if e.joint is not None for x in PLACEMENT_ERRORS)
     levels = _levels(top, {**levels, "full": full}, [e.parameter for e in chain if e.parameter])
@@ -139,6 +148,7 @@ def _robot(top: Node) -> Robot:
         levels=levels,
         parameter_names=levels.get("lengths+offsets") or full,
         source=str(top.path),
+        link_masses=masses,
     )
     for joint, turns in zip(joints, robot.joint_is_revolute, strict=True):
         valid = ANGLES if turns else LENGTHS
@@ -218,6 +228,23 @@ def _levels(top: Node, own: Levels, known: Sequence[str]) -> Levels:
             raise top["levels"].error(repr(name), expected)
         levels[name] = node.names(known)
     return {key: tuple(names) for key, names in levels.items() if names}
+
+
+def _mass(node: Node, names: Sequence[str], chain: Sequence[Element], by_elements: bool) -> LinkMass:
+    """What a joint carries; seen from the row of a table, its place is turned back to the joint's motion."""
+    node.mapping(MASS_KEYS, ("joint", "mass"))
+    joint, mass = names.index(_joint_name(node["joint"], names)), node["mass"].number()
+    if not mass > 0.0:
+        raise node["mass"].refused("a mass above 0 kg")
+    place = node.get("xyz", [0.0, 0.0, 0.0]).numbers(3)
+    if not by_elements:
+        motion = next(i for i, e in enumerate(chain) if e.joint == joint)
+        row = [f"{names[joint]}.{quantity}" for quantity in ("theta", "d", "a", "alpha")]
+        for e in reversed([e for e in chain[motion + 1 :] if e.parameter in row]):
+            shift = e.sign * e.value
+            place = rotation(e.axis, shift) @ place if e.is_rotation else place + shift * np.eye(3)[e.axis]
+    x, y, z = (float(v) for v in place)
+    return LinkMass(joint, mass, (x, y, z))
 
 
 def _base(node: Node) -> tuple[Element, ...]:

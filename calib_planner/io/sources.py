@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -138,7 +138,7 @@ def _csv(path: str, robot: Robot, settings: SourceSettings) -> Source:
         settings.note(f"{path}: joint angles up to {turning.max():.4g} rad; are they degrees (--degrees)?")
     if settings.millimetres:
         std = None if data.std is None else np.asarray(data.std) / 1e3
-        data = Measurements(data.joint_names, data.q, data.p / 1e3, std)
+        data = replace(data, points=data.p / 1e3, std=std)
     return Source(path, data, file.lines, "line")
 
 
@@ -170,4 +170,9 @@ def _together(files: Sequence[Source], noise_given: bool) -> Measurements:
             raise FileFormatError(without[0], "header", "no std_… columns", "them, as in other files", advice)
         std = None if without else np.concatenate([np.asarray(d.std) for d in parts])
     q, p = np.concatenate([d.q for d in parts]), np.concatenate([d.p for d in parts])
-    return Measurements(parts[0].joint_names, q, p, std)
+    without = [s.path for s in files if s.data.payload is None]
+    if without and len(without) < len(files):
+        advice = "add it: 0 where the robot carried nothing"
+        raise FileFormatError(without[0], "header", "no column payload", "it, as in other files", advice)
+    payload = None if without else np.concatenate([np.asarray(d.payload) for d in parts])
+    return Measurements(parts[0].joint_names, q, p, std, payload)

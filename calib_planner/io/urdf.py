@@ -4,7 +4,8 @@
 after the joint) and one rotation or translation about its axis, with the offset parameter ``<joint>.offset``. An
 axis other than ±x, ±y, ±z is reached by two constant rotations and left by their inverse. Fixed joints keep their
 place in the chain, as constants. Of joints outside the chain only the links that they join are read, so that an
-oddity of a gripper does not stop the calibration of the arm. A document type declaration is refused: no entity is
+oddity of a gripper does not stop the calibration of the arm. Mass and centre of gravity of the links that the
+chain carries (``<inertial>``) are kept as they stand. A document type declaration is refused: no entity is
 ever expanded.
 
 *Writing.* The calibrated URDF is the source, byte for byte, except for the origins of the joints that changed.
@@ -33,12 +34,14 @@ from calib_planner.io.text import decode, read_bytes, read_text, user_path, writ
 from calib_planner.robot import (
     Element,
     JointOrigins,
+    LinkMass,
     Origin,
     Robot,
     check_joint_names,
     joint_origins,
     not_in_origins,
     pose_elements,
+    rotation,
     target_elements,
 )
 from calib_planner.units import brief
@@ -106,6 +109,7 @@ def parse_urdf(text: str, source: str, base_link: str | None = None, tip_link: s
             parameter_names=(*lengths, *offsets),
             source=source,
             from_urdf=True,
+            link_masses=_link_masses(source, root, chain, moving),
         )
     except FileFormatError:
         raise
@@ -194,6 +198,13 @@ class _Joint:
             raise self.error(" axis", "0 0 0", "a direction")
         return _unit(axis)
 
+    def placed(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """``xyz`` and ``rpy``, or ``None`` for what is no such numbers: of joints outside the chain."""
+        item = self.item.find("origin")
+        texts = ("0 0 0" if item is None else item.get(key, "0 0 0") for key in ("xyz", "rpy"))
+        xyz, rpy = (_floats(text, 3) for text in texts)
+        return xyz, rpy
+
     @property
     def limits(self) -> tuple[float, float]:
         """Lower and upper limit [rad | m]; zeros for a joint that does not move."""
@@ -271,6 +282,50 @@ def _chain(source: str, root: ElementTree.Element, base_link: str | None, tip_li
     if not any(j.type in MOVING for j in chain):
         raise FileFormatError(source, f"chain from {top!r} to {tip_link!r}", "no moving joint", "at least one")
     return chain
+
+
+def _link_masses(
+    source: str, root: ElementTree.Element, chain: list[_Joint], moving: list[str]
+) -> tuple[LinkMass, ...]:
+    """The ``<inertial>`` of every link that the chain carries, seen from the last joint that moves before it.
+
+    Links beside the chain count where only fixed joints hold them: where a gripper's fingers stand is not known.
+    """
+    links = {str(item.get("name")): item for item in root.findall("link")}
+    fixed: dict[str, list[_Joint]] = {}
+    for joint in _by_child(source, root, list(links)).values():
+        if joint.type == "fixed":
+            fixed.setdefault(joint.parent, []).append(joint)
+    result: list[LinkMass] = []
+    for joint in chain:
+        if joint.type == "fixed":
+            continue
+        waiting: list[tuple[str, FloatArray, FloatArray]] = [(joint.child, np.eye(3), np.zeros(3))]
+        while waiting:
+            link, turn, place = waiting.pop()
+            inertial = _inertial(links[link])
+            if inertial is not None:
+                x, y, z = (float(v) for v in place + turn @ inertial[1])
+                result.append(LinkMass(moving.index(joint.name), inertial[0], (x, y, z)))
+            for below in fixed.get(link, ()):
+                xyz, rpy = below.placed()
+                if xyz is not None and rpy is not None:
+                    roll, pitch, yaw = rpy
+                    further = turn @ rotation(2, yaw) @ rotation(1, pitch) @ rotation(0, roll)
+                    waiting.append((below.child, further, place + turn @ xyz))
+    return tuple(result)
+
+
+def _inertial(link: ElementTree.Element) -> tuple[float, FloatArray] | None:
+    """Mass [kg] and centre of gravity (3,) [m], NaN where they are no numbers; ``None`` without a mass."""
+    inertial = link.find("inertial")
+    weight = None if inertial is None else inertial.find("mass")
+    if inertial is None or weight is None:
+        return None
+    mass = _floats(weight.get("value", ""), 1)
+    origin = inertial.find("origin")
+    centre = _floats("0 0 0" if origin is None else origin.get("xyz", "0 0 0"), 3)
+    return np.nan if mass is None else float(mass[0]), np.full(3, np.nan) if centre is None else centre
 
 
 def _by_child(source: str, root: ElementTree.Element, links: list[str]) -> dict[str, _Joint]:

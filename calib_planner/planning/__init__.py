@@ -22,8 +22,6 @@ from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.feasibility import Constraint, Feasibility
 from calib_planner.planning.information import (
     InformationModel,
-    covariance,
-    error_variance,
     plan_space,
     smallest_size,
 )

@@ -24,17 +24,23 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray
+from calib_planner.error_model import FELT, accuracy_rows
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning.criteria import Accuracy, Criterion, Eliminating, accuracy_weights, make_criterion
+from calib_planner.planning.criteria import (
+    POSE_CRITERIA,
+    Accuracy,
+    Criterion,
+    Eliminating,
+    accuracy_weights,
+    make_criterion,
+)
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.robot import Identifiability, Linearisation, Robot, analyse, is_nuisance
 from calib_planner.tracker import Isotropic, Noise, covariance_gradient
-
-RANK_TOLERANCE = 1e-9
-"""Eigenvalues of a scaled information matrix below this share of the largest count as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,37 +134,6 @@ class LinearisedInformation:
         return gradient + np.einsum("ntx,jtxn->nj", force, self.lin.joint_columns)
 
 
-def covariance(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverse of an information matrix on the space it spans, and a basis of the rest.
-
-    Scaled to unit diagonal first, so that the rank does not depend on the units of the parameters.
-
-    Returns:
-        (p, p) pseudo-inverse, and (p, p − rank) directions that the data cannot see (unit columns).
-    """
-    diagonal = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    scale = np.where(diagonal > 0, diagonal, 1.0)
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    seen = values > RANK_TOLERANCE * max(float(values[-1]), 1e-300)
-    basis = vectors[:, seen] / scale[:, None]
-    hidden = vectors[:, ~seen] / scale[:, None]
-    if hidden.size:
-        hidden = hidden / np.linalg.norm(hidden, axis=0)
-    return (basis / values[seen]) @ basis.T, hidden
-
-
-def error_variance(test_jacobian: FloatArray, matrix: FloatArray) -> float:
-    """ρ0² of eq. (14) for J0 (3·targets, p): infinite if J0 needs what the plan cannot see.
-
-    With several targets, the mean over the targets of the squared distance.
-    """
-    inverse, hidden = covariance(matrix)
-    if hidden.size and np.abs(test_jacobian @ hidden).max() > 1e-6 * np.abs(test_jacobian).max():
-        return float("inf")
-    targets = test_jacobian.shape[0] / 3
-    return float(np.einsum("ij,jk,ik->", test_jacobian, inverse, test_jacobian)) / targets
-
-
 # ── the plan problem in numbers ──────────────────────────────────────────────────────────────────────────
 
 SAMPLE = 512
@@ -178,8 +153,9 @@ class PlanSpace:
         single: Information of one measurement.
         prior: (p, p) M_0.
         feasibility: The constraints.
-        test_jacobians: (K, 3·targets, p) at the test poses, nuisance columns zero.
-        general: (p, p) mean accuracy weight over the workspace, nuisance zero.
+        test_jacobians: (K, 3·targets, p) rows of (M3) at the test poses, base and target columns included.
+        blind: (K,) whether a test pose feels what no configuration shows.
+        general: (p, p) mean accuracy weight over the workspace, of the same rows.
         sample: (p, p) mean information of one measurement over the workspace.
     """
 
@@ -192,30 +168,37 @@ class PlanSpace:
     prior: FloatArray
     feasibility: Feasibility
     test_jacobians: FloatArray
+    blind: NDArray[np.bool_]
     general: FloatArray
     sample: FloatArray
 
     def criterion(self, name: str) -> Criterion:
-        """The criterion of that name over the p parameters, nuisance eliminated."""
-        p, inner = len(self.robot.parameter_names), list(self.interest)
-        tests = accuracy_weights(self.test_jacobians[:, :, inner])
-        made = make_criterion(name, len(inner), tests, self.problem.weight_array)
-        if len(inner) == p:
+        """The criterion of that name over the p parameters.
+
+        Accuracies are of (M3), the same for every equivalent choice of parameters. Criteria of the parameters
+        are about those of interest, base and targets eliminated: they hold for the choice of free parameters
+        (the gauge) in which the others stay at their nominal values.
+        """
+        if name in POSE_CRITERIA:
+            tests = accuracy_weights(self.test_jacobians)
+            return make_criterion(name, len(self.robot.parameter_names), tests, self.problem.weight_array)
+        made = make_criterion(name, len(self.interest), np.empty(0), np.ones(1))
+        if not self.nuisance:
             return made
-        return Eliminating(made, self.interest, tuple(i for i in range(p) if i not in self.interest))
+        return Eliminating(made, self.interest, self.nuisance)
+
+    @property
+    def nuisance(self) -> tuple[int, ...]:
+        """Indices of the parameters of base and targets."""
+        return tuple(i for i in range(len(self.robot.parameter_names)) if i not in self.interest)
 
     def search_criterion(self) -> Criterion:
         """What the search maximises: the criterion wanted, with a share for accuracy elsewhere."""
         share = self.problem.search.general_weight
         plain = self.criterion(self.problem.criterion)
-        inner = plain.inner if isinstance(plain, Eliminating) else plain
-        if self.problem.criterion != "test_pose" or not isinstance(inner, Accuracy) or share == 0:
+        if self.problem.criterion != "test_pose" or not isinstance(plain, Accuracy) or share == 0:
             return plain
-        keep = np.ix_(self.interest, self.interest)
-        mixed = Accuracy((1.0 - share) * inner.weight + share * self.general[keep])
-        if isinstance(plain, Eliminating):
-            return Eliminating(mixed, plain.interest, plain.nuisance)
-        return mixed
+        return Accuracy((1.0 - share) * plain.weight + share * self.general)
 
 
 def plan_space(problem: PlanProblem) -> PlanSpace:
@@ -245,10 +228,15 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     interest = tuple(i for i, n in enumerate(robot.parameter_names) if not is_nuisance(n)) or tuple(
         range(len(free))
     )
-    mask = np.isin(np.arange(len(free)), interest)
+    poses = problem.test_pose_array
     tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(free)))
-    if len(problem.test_pose_array):
-        tests = robot.jacobian(problem.test_pose_array) * mask
+    blind = np.zeros(len(poses), bool)
+    if len(poses):
+        tests = accuracy_rows(*robot.positions_and_jacobian(poses), problem.accuracy_frame)
+        felt = accuracy_rows(*problem.robot.positions_and_jacobian(poses), problem.accuracy_frame)
+        unseen = np.abs(felt @ identifiable.directions.T).max(axis=(1, 2), initial=0.0)
+        blind = unseen > FELT * np.abs(felt).max()
+    everywhere = accuracy_rows(problem.robot.positions(q), jacobians, problem.accuracy_frame)[:, :, free]
     single = InformationModel(robot, problem.instrument, problem.repeatability)
     return PlanSpace(
         problem=problem,
@@ -260,7 +248,8 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         prior=prior[np.ix_(free, free)],
         feasibility=feasibility,
         test_jacobians=tests,
-        general=accuracy_weights(jacobians[:, :, free] * mask).mean(axis=0),
+        blind=blind,
+        general=accuracy_weights(everywhere).mean(axis=0),
         sample=single.at(q).mean(axis=0),
     )
 

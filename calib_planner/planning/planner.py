@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray, one_thread
+from calib_planner.error_model import FELT, covariance, error_variance
 from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.prove import Proof, prove_bound
 from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
 from calib_planner.planning.discrepancy import PredictionProblem, choose_for_prediction
-from calib_planner.planning.information import PlanSpace, covariance, error_variance, plan_space
+from calib_planner.planning.information import PlanSpace, plan_space
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import STATUS, Plan, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
@@ -292,9 +293,10 @@ def _assemble(
     configurations = configurations[visiting_order(configurations, robot)]
     matrix = space.model.at(configurations).sum(axis=0) + space.prior
     inverse, hidden = covariance(matrix)
-    per = np.sqrt([error_variance(j, matrix) for j in space.test_jacobians])
+    per = np.sqrt([error_variance(rows, inverse, hidden) for rows in space.test_jacobians])
+    per[space.blind] = np.inf
     shares = problem.weight_array / max(problem.weight_array.sum(), 1e-300)
-    accuracy = float(np.sqrt(shares @ per**2)) if len(per) else float("nan")
+    accuracy = float(np.sqrt(shares[shares > 0] @ per[shares > 0] ** 2)) if len(per) else float("nan")
     plain = problem.criterion == "test_pose" and not problem.compound
     # For the paper's criterion Ψ is that of the figure reported, to the last digit.
     psi = accuracy**-2 if plain else _psi_of(space, target, configurations)
@@ -308,13 +310,17 @@ def _assemble(
     value_bound = bound if problem.compound or not design else reported_value(name, bound, size, n)
     general = float("inf") if hidden.size else float(np.trace(space.general @ inverse))
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
-    status = "singular" if hidden.size and status == "ok" else status
+    status = "singular" if (hidden.size or space.blind.any()) and status == "ok" else status
     combinations = space.identifiability.combinations
     note = f" Not identifiable by any plan, fixed at nominal: {', '.join(combinations)}." if combinations else ""
     if problem.discrepancy is not None:
         note += (
             " Chosen for a robot with systematic errors; value, bound and efficiency are for white noise alone."
         )
+    if space.blind.any():
+        note += " No configuration shows what a test pose needs: its error is unlimited."
+    elif combinations and (problem.compound or problem.criterion not in POSE_CRITERIA):
+        note += " The criterion holds for this choice of parameters."
     note += f" {proof.text}" if proof else ""
     quality = PlanQuality(
         predicted_accuracy_per_test_pose=per,
@@ -384,12 +390,14 @@ def _psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) 
 
 def _blind(space: PlanSpace, hidden: FloatArray) -> bool:
     """Whether the criterion needs what the plan cannot see."""
+    if space.problem.criterion in POSE_CRITERIA and space.blind.any():
+        return True
     if not hidden.size:
         return False
     if space.problem.criterion not in POSE_CRITERIA or space.problem.compound:
         return True
     tests = space.test_jacobians
-    return bool(np.abs(tests @ hidden).max() > 1e-6 * np.abs(tests).max())
+    return bool(np.abs(tests @ hidden).max() > FELT * np.abs(tests).max())
 
 
 def _regular(matrix: FloatArray, hidden: FloatArray) -> FloatArray:

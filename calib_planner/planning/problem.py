@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
+from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA
@@ -100,12 +101,15 @@ class PlanProblem:
 
     Attributes:
         robot: The robot, its active parameters being those to be identified. Parameters of the base and of the
-            targets are nuisance: they are estimated with the rest and eliminated from the criterion.
+            targets are estimated with the rest. Accuracies contain their errors; criteria of the parameters
+            themselves are about the others.
         test_poses: (K, joints) configurations where accuracy matters [rad | m]; a path is many of them.
         configurations: m, number of different configurations.
         repetitions: Measurements at each configuration.
         weights: (K,) weights of the test poses; equal if ``None``.
         criterion: One of ``criteria.CRITERIA``.
+        accuracy_frame: What an accuracy is, (M3): ``world``, the error in the frame of the points, or ``robot``,
+            the same up to a rigid motion of the base.
         compound: Other criteria with their shares, e.g. ``{"d": 0.3}``: the plan then maximises the weighted
             geometric mean of efficiencies, in which ``criterion`` has the rest of the weight.
         noise: The instrument; a number is the standard deviation of every coordinate of a point [m].
@@ -134,6 +138,7 @@ class PlanProblem:
     constraints: tuple[Constraint, ...] = ()
     candidates: Candidates | None = None
     search: Search = Search()
+    accuracy_frame: str = "world"
 
     def __post_init__(self) -> None:
         put, robot = object.__setattr__, self.robot
@@ -143,6 +148,8 @@ class PlanProblem:
             raise InputError("robot", "no active parameters", "at least one", "use robot.with_parameters(...)")
         if self.criterion not in CRITERIA:
             raise UnknownNameError("criterion", str(self.criterion), CRITERIA)
+        if self.accuracy_frame not in ACCURACIES:
+            raise UnknownNameError("accuracy_frame", str(self.accuracy_frame), ACCURACIES)
         put(self, "compound", _check_compound(self.compound))
         self._check_poses()
         put(self, "configurations", check_count("configurations", self.configurations, high=10_000))

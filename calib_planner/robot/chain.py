@@ -25,6 +25,7 @@ from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.robot.elements import Element, roll_pitch_yaw, rotation
 from calib_planner.robot.kinematics import Program, codes_of, compile_program, structure_of
 from calib_planner.robot.linearisation import Layout, Linearisation, Posture
+from calib_planner.robot.masses import LinkMass, fault_of
 from calib_planner.robot.parameters import Parameter, resolve_parameters
 
 MOST_PROGRAMS = 64
@@ -63,6 +64,7 @@ class Robot:
         parameter_names: Active parameters, the order of all Jacobian columns.
         source: What the robot was read from.
         from_urdf: Whether it was read from a URDF, that is from the description of a real robot.
+        link_masses: What its file says of the masses of its links; see ``mass_fault``.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Robot:
     parameter_names: tuple[str, ...] = ()
     source: str = ""
     from_urdf: bool = False
+    link_masses: tuple[LinkMass, ...] = ()
 
     def __post_init__(self) -> None:
         joints = [e.joint for e in self.elements if e.joint is not None]
@@ -92,6 +95,9 @@ class Robot:
         for name in self.parameter_names:
             if name not in known:
                 raise UnknownNameError("parameters", name, names)
+        for part in self.link_masses:
+            if not 0 <= part.joint < len(self.joint_names):
+                raise InputError("link_masses", f"joint number {part.joint}", "the number of a joint, from 0")
 
     # ── making ───────────────────────────────────────────────────────────────────────────────────────
 
@@ -188,6 +194,16 @@ class Robot:
     def joint_is_revolute(self) -> NDArray[np.bool_]:
         """(joints,) whether each joint turns; the others slide."""
         return np.array(self._layout.joint_rotates)
+
+    @cached_property
+    def mass_fault(self) -> str:
+        """Why ``link_masses`` are not what the links weigh, in words; empty if nothing speaks against them."""
+        reach = 0.0
+        for e in self.elements[9:]:
+            if not e.is_rotation:
+                slide = 0.0 if e.joint is None else float(np.abs(self.joint_limits[e.joint]).max())
+                reach += abs(e.value) + slide
+        return fault_of(self.link_masses, self.joint_names, reach)
 
     def beyond_limits(self, q: FloatArray) -> NDArray[np.bool_]:
         """(N, joints) [rad | m] → (N, joints) bool: which coordinates are outside the joint limits."""

@@ -1,5 +1,9 @@
 """A robot with hidden true parameters, a tracker with noise, and what goes wrong on a shop floor.
 
+How a sound robot errs is drawn from an error model (``error_model.Truth``), the same that identifications reckon
+with: what its parts are off, what its joints do under weight and as they turn, and what is new at each arrival.
+``Faults`` are what goes wrong beside that.
+
 Every random number has a seed. Each purpose has a stream of random numbers of its own, so that switching a fault
 on changes no other draw.
 """
@@ -13,17 +17,28 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner.arrays import FloatArray, check_configurations, check_count, check_number, check_ranges, ranged
+from calib_planner.arrays import (
+    FloatArray,
+    IntArray,
+    check_configurations,
+    check_count,
+    check_number,
+    check_ranges,
+    ranged,
+)
+from calib_planner.error_model import ErrorModel, Truth, VisitErrors, typical
 from calib_planner.errors import InputError
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.tracker import Noise
+from calib_planner.tracker import Isotropic, Noise
 
 NEVER = -1
-LENGTH_ERROR = 1e-3
+LENGTH_ERROR = typical().values["placement.length"]
 """Default standard deviation of true length errors [m]."""
-ANGLE_ERROR = 1e-3
+ANGLE_ERROR = typical().values["placement.angle"]
 """Default standard deviation of true angle errors [rad]."""
+NOISELESS = 1e-30
+"""What stands in the error model for the standard deviation of a tracker without noise [m]."""
 
 
 def independent_seeds(seed: int, count: int) -> list[int]:
@@ -34,7 +49,12 @@ def independent_seeds(seed: int, count: int) -> list[int]:
 def random_deviations(
     robot: Robot, seed: int, length: float = LENGTH_ERROR, angle: float = ANGLE_ERROR
 ) -> dict[str, float]:
-    """True errors of the active parameters, drawn from normal distributions [m | rad]."""
+    """True errors of the active parameters, drawn from normal distributions [m | rad].
+
+    By default lengths and angles err by the standard deviations that the typical error model expects. So do the
+    zeros of the joints, of which that model expects less (``placement.ZERO``, 20 mrad): its prior has to hold for
+    zeros that were set by eye, while a joint that was mastered as its maker says stands within about 1 mrad.
+    """
     rng = np.random.default_rng([seed, 1])  # a stream of its own: noise may have the same seed
     draw = rng.standard_normal(len(robot.parameters))
     return {
@@ -52,22 +72,31 @@ class SimulatedCell:
         deviations: True deviation of each named parameter [m | rad].
         sigma: Standard deviation of one tracker coordinate [m].
         instrument: The tracker's noise by direction, in the frame of the points; ``None``: ``sigma`` alike.
-        truth: The robot with those deviations.
+        error_model: How the robot errs besides the deviations; ``None``: as the paper's, not at all. Its noise is
+            replaced by that of the tracker.
+        seed: Of the coefficients that are drawn from the error model.
+        truth: The robot with those deviations and coefficients.
     """
 
     nominal: Robot
     deviations: Mapping[str, float]
     sigma: float = 3e-5
     instrument: Noise | None = None
-    truth: Robot = field(init=False)
+    error_model: ErrorModel | None = None
+    seed: int = 0
+    truth: Truth = field(init=False)
 
     def __post_init__(self) -> None:
         check_number("sigma", self.sigma, low=0, high=1, unit="m")
+        check_count("seed", self.seed, low=0, high=2**63 - 1)
         object.__setattr__(self, "deviations", dict(self.deviations))
-        object.__setattr__(self, "truth", self.nominal.with_deviations(self.deviations))
+        noise = Isotropic(max(self.sigma, NOISELESS)) if self.instrument is None else self.instrument
+        model = (ErrorModel.paper() if self.error_model is None else self.error_model).with_noise(noise)
+        rng = draws(self.seed, Purpose.COEFFICIENTS)
+        object.__setattr__(self, "truth", Truth.draw(self.nominal, model, rng, self.deviations))
 
     def measure(self, configurations: ArrayLike, repetitions: ArrayLike | int, seed: int) -> Measurements:
-        """Measure each configuration ``repetitions`` times; one row per measurement."""
+        """Measure each configuration ``repetitions`` times; each time one row and one visit."""
         q = check_configurations("configurations", configurations, self.nominal.joint_names)
         if np.ndim(repetitions) == 0:
             check_count("repetitions", repetitions)
@@ -75,17 +104,15 @@ class SimulatedCell:
             raise InputError("repetitions", np.shape(repetitions), f"one number or {len(q)} numbers")
         rows = np.repeat(q, np.asarray(repetitions, np.int64), axis=0)
         rng = np.random.default_rng(seed)
-        points = self.truth.positions(rows)
+        points = self.truth.positions(rows, visit_errors(self.truth, seed, np.arange(len(rows))))
         noisy = points + self.noise(points, rng)
         return Measurements(self.nominal.joint_names, rows, noisy, self._std(points))
 
     def noise(self, points: FloatArray, rng: np.random.Generator) -> FloatArray:
         """(…, 3) errors of one sample of each of the ``points`` (…, 3) [m]."""
-        draw = rng.standard_normal(points.shape)
-        if self.instrument is None:
-            return self.sigma * draw
-        factor = np.linalg.cholesky(self.instrument.covariance(points))
-        return np.asarray((factor @ draw[..., None])[..., 0])
+        if self.instrument is None and self.sigma == 0:
+            return np.zeros(points.shape)
+        return self.truth.noise(points, rng.standard_normal(points.shape))
 
     def _std(self, points: FloatArray) -> FloatArray | None:
         """Standard deviation of each coordinate, like ``points`` [m]; ``None`` without noise."""
@@ -95,7 +122,7 @@ class SimulatedCell:
         return np.full(points.shape, self.sigma) if self.sigma > 0 else None
 
     def position_errors(self, model: Robot, configurations: ArrayLike) -> FloatArray:
-        """(N, targets) distances between the true robot and ``model``, eq. (4) [m]."""
+        """(N, targets) distances between the true robot, as it stands on average, and ``model``, eq. (4) [m]."""
         difference = self.truth.positions(configurations) - model.positions(configurations)
         return np.linalg.norm(difference, axis=2)
 
@@ -114,9 +141,9 @@ class Faults:
 
     *Robot*
 
-    ``transmission_error``: root mean square of φ(q), what a joint turns beyond its reading; a function of its own
-    reading with ``transmission_harmonics`` waves per turn (half a turn over the range if sliding), the n-th of
-    amplitude ∝ 1/n, no constant part.
+    ``transmission_error``: root mean square of a joint function φ(q), what a joint turns beyond its reading, on
+    top of those of the error model; a function of its own reading with ``transmission_harmonics`` waves per turn
+    (half a turn over the range if sliding), the n-th of amplitude ∝ 1/n, no constant part.
     ``encoder_resolution``: reported joints are rounded to multiples of it; the arm is where it is.
     ``unsettled_probability``: share of arrivals after which the arm still moves while its encoders rest. It
     swings by ``oscillation`` · e^(−t/``oscillation_decay``) · cos(2π ``oscillation_frequency`` t) and creeps by
@@ -212,6 +239,8 @@ class Purpose(IntEnum):
     DUPLICATE_DELAY = 114
     REORDER = 115
     REORDER_DELAY = 116
+    COEFFICIENTS = 117
+    VISIT = 118
 
 
 def draws(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
@@ -223,3 +252,18 @@ def directions(rng: np.random.Generator, count: int) -> FloatArray:
     """(count, 3) unit vectors, uniform on the sphere."""
     raw = rng.standard_normal((count, 3))
     return np.asarray(raw / np.linalg.norm(raw, axis=1)[:, None])
+
+
+def visit_errors(truth: Truth, seed: int, arrivals: IntArray) -> VisitErrors | None:
+    """What is new at each of the ``arrivals`` (n,), which tell by their numbers what is drawn.
+
+    Nothing is new at those below 0: the robot is on its way. ``None``: nothing ever is.
+    """
+    model = truth.model
+    if model.visits is None and not model.points.floor:
+        return None
+    numbers, place = np.unique(arrivals, return_inverse=True)
+    drawn = [truth.draw_visits(1, draws(seed, Purpose.VISIT, max(int(k), 0))) for k in numbers]
+    there = (numbers >= 0)[place, None]
+    joints = np.concatenate([d.joints for d in drawn])[place] * there
+    return VisitErrors(joints, np.concatenate([d.points for d in drawn])[place] * there[:, :, None])

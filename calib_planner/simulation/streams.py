@@ -72,7 +72,7 @@ class Streams:
         self.world, self._where, self._start = world, where, start
         self._sight = Sight(world)
         rates = rates or Rates()
-        targets = range(len(world.cell.truth.targets))
+        targets = range(len(world.robot.targets))
         self._samplers = [_Sampler(rates.joints, 0.0), *(_Sampler(rates.tracker, PHASE) for _ in targets)]
         self._posts = [_Post(world, k) for k in range(len(self._samplers))]
         self._now, self._count = start, 0

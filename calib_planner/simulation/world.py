@@ -1,9 +1,9 @@
 """A simulated robot and tracker with faults: where the targets really are, and what the tracker sees of them.
 
-``World`` is a pure function of where the robot is told to be: whatever happens at an arrival is drawn from the
-seed and the arrival's number. ``Sight`` looks at it: a station that turned by R about its place c and moved by v
-sees a point p at R(p − c) + c + v; beam breaks, outliers and noise come on top. ``simulated`` measures one
-configuration at a time, as a campaign wants it.
+``World`` is a pure function of where the robot is told to be: whatever happens at an arrival, what the error
+model calls a visit among it, is drawn from the seed and the arrival's number. ``Sight`` looks at it: a station
+that turned by R about its place c and moved by v sees a point p at R(p − c) + c + v; beam breaks, outliers and
+noise come on top. ``simulated`` measures one configuration at a time, as a campaign wants it.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from calib_planner.campaign import (
     Unreachable,
     run_campaign,
 )
+from calib_planner.error_model import ErrorModel, Truth
 from calib_planner.robot import Robot
 from calib_planner.simulation.cell import (
     NEVER,
@@ -36,10 +37,13 @@ from calib_planner.simulation.cell import (
     draws,
     independent_seeds,
     random_deviations,
+    visit_errors,
 )
-from calib_planner.simulation.corrections import JointCorrections, phases
 from calib_planner.simulation.motion import Stand
 from calib_planner.tracker import LaserTracker, Noise
+
+SETTLED = 1e9
+"""Time since an arrival after which no arm moves any more [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +69,16 @@ class World:
         return self.cell.nominal
 
     @cached_property
-    def transmission(self) -> JointCorrections:
-        """φ of every joint: the robot is where its geometry puts it at q + φ(q)."""
-        robot, faults = self.robot, self.faults
-        count, n = len(robot.joint_names), faults.transmission_harmonics
+    def truth(self) -> Truth:
+        """The cell's robot, its joints erring by the transmission error as well."""
+        size, n = self.faults.transmission_error, self.faults.transmission_harmonics
+        if size == 0.0:
+            return self.cell.truth
+        count = len(self.robot.joint_names)
         raw = draws(self.seed, Purpose.TRANSMISSION).standard_normal((2, count, n)) / np.arange(1, n + 1)
         # The mean square of a wave is half of its amplitude's square.
-        raw *= faults.transmission_error / np.sqrt(0.5 * np.sum(raw**2, axis=(0, 2)))[:, None]
-        return JointCorrections(robot.joint_names, *phases(robot), *raw)
+        raw *= size / np.sqrt(0.5 * np.sum(raw**2, axis=(0, 2)))[:, None]
+        return self.cell.truth.with_joint_functions(raw.transpose(1, 0, 2), size)
 
     def reported(self, joints: FloatArray) -> FloatArray:
         """(n, joints) what the encoders say [rad | m]."""
@@ -80,11 +86,15 @@ class World:
         return np.rint(joints / step) * step if step > 0 else joints
 
     def targets(self, stand: Stand) -> FloatArray:
-        """(n, targets, 3) where the targets are, in the frame of an undisturbed station [m]."""
-        q = self.transmission.actual(stand.joints) if self.faults.transmission_error > 0 else stand.joints
-        points = self.cell.truth.positions(q)
+        """(n, targets, 3) where the targets are, in the frame of an undisturbed station [m].
+
+        While it stands at an arrival, the robot errs as it does at that visit; else as it does on average.
+        """
+        still = np.isfinite(stand.since)
+        visits = visit_errors(self.truth, self.seed, np.where(still, stand.arrival, NEVER))
+        points = self.truth.positions(stand.joints, visits)
         if self.faults.reseat_at != NEVER:
-            elsewhere = self._reseated.positions(q)
+            elsewhere = self._reseated.positions(stand.joints, visits)
             moved = stand.arrival >= self.faults.reseat_at
             points = np.where(moved[:, None, None], elsewhere, points)
         return points + self._swing(stand)[:, None, :]
@@ -94,7 +104,7 @@ class World:
 
         Args:
             predicted: Points (K, targets, 3) [m] at configurations, such as ``Estimate.positions``.
-            poses: (K, joints) configurations at which the robot stands still [rad | m].
+            poses: (K, joints) configurations [rad | m], at which the robot stands as it does on average.
         """
         stand = Stand(poses, np.arange(len(poses)), np.full(len(poses), np.inf))
         off = predicted(poses) - self.targets(stand)
@@ -111,10 +121,10 @@ class World:
                 yield still & (stand.arrival == k), rng
 
     @cached_property
-    def _reseated(self) -> Robot:
-        truth = self.cell.truth
-        shift = self.faults.reseat_by * directions(draws(self.seed, Purpose.RESEAT), len(truth.targets))
-        return truth.with_targets(truth.target_offsets + shift)
+    def _reseated(self) -> Truth:
+        robot = self.truth.robot
+        shift = self.faults.reseat_by * directions(draws(self.seed, Purpose.RESEAT), len(robot.targets))
+        return self.truth.with_targets(robot.target_offsets + shift)
 
     def _swing(self, stand: Stand) -> FloatArray:
         """(n, 3) what an arm that has not settled adds [m]."""
@@ -134,7 +144,7 @@ class Sight:
     def __init__(self, world: World) -> None:
         self.world = world
         cell, seed = world.cell, world.seed
-        targets = range(len(cell.truth.targets))
+        targets = range(len(cell.nominal.targets))
         self._noise = [draws(seed, Purpose.NOISE, t) for t in targets]
         self._odd = [draws(seed, Purpose.OUTLIER, t) for t in targets]
         self._odd_size = [draws(seed, Purpose.OUTLIER_SIZE, t) for t in targets]
@@ -232,7 +242,7 @@ def simulated(world: World, seed: int, reaches: Callable[[FloatArray], bool] = l
         nonlocal arrivals
         if not reaches(action.q):
             raise Unreachable("the robot does not get there")
-        stand = Stand(action.q[None], np.array([arrivals]), np.array([np.inf]))
+        stand = Stand(action.q[None], np.array([arrivals]), np.array([SETTLED]))
         arrivals += 1
         points = world.targets(stand)
         return np.asarray((points + world.cell.noise(points, rng))[0])
@@ -247,6 +257,7 @@ def simulate_campaign(
     noise: Noise | None = None,
     transmission: float = 0.0,
     watch: Callable[[CampaignState], None] = lambda state: None,
+    error_model: ErrorModel | None = None,
 ) -> tuple[CampaignResult, World, dict[str, float]]:
     """Run a campaign with a simulated robot of hidden errors.
 
@@ -256,12 +267,13 @@ def simulate_campaign(
         noise: The tracker's true noise, in place of ``sigma``.
         transmission: Rms error of the joints' transmissions [rad].
         watch: Called with every state.
+        error_model: How the robot errs besides its parameters; ``None``: not at all.
 
     Returns:
         The result, the world that was measured, and the true deviations by parameter [m | rad].
     """
     truth_seed, noise_seed = independent_seeds(seed, 2)
     errors = random_deviations(problem.robot, truth_seed)
-    cell = SimulatedCell(problem.robot, errors, sigma, noise)
+    cell = SimulatedCell(problem.robot, errors, sigma, noise, error_model, truth_seed)
     world = World(cell, Faults(transmission_error=transmission), truth_seed)
     return run_campaign(problem, simulated(world, noise_seed), watch), world, errors

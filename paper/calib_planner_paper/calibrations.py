@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from calib_planner.arrays import FloatArray, frozen, plain
-from calib_planner.error_model import ErrorModel
+from calib_planner.error_model import ErrorModel, covariance
 from calib_planner.identification import IdentificationProblem, identify
-from calib_planner.planning import InformationModel, covariance
+from calib_planner.planning import InformationModel
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations
 from calib_planner.tracker import Isotropic

@@ -72,7 +72,7 @@ def problem_of(
     model: ErrorModel = replace(
         typical(), placement=Placement(prior), joint_functions=JointFunctions(harmonics=6)
     )
-    return _Work(unknown(robot), Measurements(robot.joint_names, data.q, points), model, None).linearised()
+    return _Work(unknown(robot), Measurements(robot.joint_names, data.q, points), model).linearised()
 
 
 def total_covariance(problem: LinearProblem) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, Gravity, typical
 from calib_planner.identification import ModelEstimate, fit_error_model
+from calib_planner.identification.estimation import _Work
+from calib_planner.identification.left_out import left_out
 from calib_planner.measurements import Measurements
 from calib_planner.tracker import Isotropic
 
@@ -184,6 +187,61 @@ def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> N
     (good, _), (distance, ratio) = fresh_errors(clean, data, 40), fresh_errors(found, data, 40)
     assert distance.mean() < 1.3 * good.mean()
     assert 0.75 < ratio < 1.4
+
+
+# ── updates ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_an_update_says_what_a_fit_at_the_same_scales_says() -> None:
+    """Visits one by one, one with a gross error, one withdrawn; the oracle relinearises and solves anew."""
+    robot = ur10e(2)
+    data, _ = simulated(robot, ALL, 50, 3)
+    points = np.array(data.p)
+    points[33, 1] += [0.02, 0.0, -0.01]
+    data = Measurements(robot.joint_names, data.q, points)
+    found = first = fit_error_model(unknown(robot), data.select(np.arange(30)), typical())
+    for count in range(31, 41):
+        found = fit_error_model(unknown(robot), data.select(np.arange(count)), typical(), start=found)
+    rows = np.delete(np.arange(40), 7)
+    found = fit_error_model(unknown(robot), data.select(rows), typical(), start=found)
+    assert found.origin.visits == 30 and found.converged
+    assert found.knowledge.model.values == first.knowledge.model.values
+    assert np.argwhere(found.doubt > 0.0).tolist() == [[32, 1]]
+    work = _Work(found.solution.problem.robot, data.select(rows), found.solution.problem.model)
+    work.state = replace(work.state, coefficients=found.origin.coefficients, doubt=found.doubt)
+    solution = work.settle(5, 0)
+    left = left_out(solution)
+    told = found.knowledge.predict(data.q)
+    std = np.sqrt(np.trace(told.position, axis1=2, axis2=3).min() / 3.0)
+    anew = replace(found.knowledge, coefficients=work.state.coefficients)
+    assert np.abs(told.mean - anew.predict(data.q).mean).max() < 0.02 * std
+    assert found.left_out.score == pytest.approx(left.score, rel=1e-3)
+    np.testing.assert_allclose(found.left_out.residuals, left.residuals, atol=0.02 * std)
+    whole = fit_error_model(unknown(robot), data.select(rows), typical())
+    apart = whole.knowledge.predict(data.q[40:]).mean - told.mean[40:]
+    assert np.sqrt(np.mean(apart**2) / np.mean(np.trace(told.position[40:], axis1=2, axis2=3) / 3.0)) < 0.5
+
+
+def test_what_an_update_cannot_do_is_a_full_fit() -> None:
+    robot = ur10e(2)
+    data, _ = simulated(robot, {}, 45, 5)
+    start = fit_error_model(unknown(robot), data.select(np.arange(20)), typical())
+
+    def visits(robot: Robot, data: Measurements, model: ErrorModel) -> int:
+        return fit_error_model(robot, data, model, start=start).origin.visits
+
+    assert visits(unknown(robot), data.select(np.arange(26)), typical()) == 20
+    assert visits(unknown(robot), data, typical()) == 45  # more than twice as many
+    assert visits(robot, data.select(np.arange(21)), typical()) == 21  # base and tool known
+    assert visits(unknown(robot), data.select(np.arange(21)), typical(Isotropic(1e-4))) == 21
+    assert visits(unknown(robot), data.select(np.arange(21, 45)), typical()) == 24  # other visits
+    noisy = np.array(data.p)
+    noisy[20:] += np.random.default_rng(0).normal(0.0, 1.2e-4, noisy[20:].shape)  # four times the noise
+    noisy_data = Measurements(robot.joint_names, data.q, noisy).select(np.arange(40))
+    found = fit_error_model(unknown(robot), noisy_data, typical(), start=start)
+    assert found.origin.visits == 40
+    again = fit_error_model(unknown(robot), noisy_data, typical())
+    np.testing.assert_array_equal(found.knowledge.coefficients, again.knowledge.coefficients)
 
 
 # ── measured robots ──────────────────────────────────────────────────────────────────────────────────

@@ -10,7 +10,17 @@ from robots import mixed, random_configurations
 
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Gravity, JointFunctions, Mass, Placement, Points, Prior, typical
+from calib_planner.error_model import (
+    ErrorModel,
+    Gravity,
+    JointFunctions,
+    Mass,
+    Payload,
+    Placement,
+    Points,
+    Prior,
+    typical,
+)
 from calib_planner.error_model.knowledge import Knowledge, prior_information
 from calib_planner.error_model.knowledge import information as information_of
 from calib_planner.errors import InputError, UnknownNameError
@@ -193,12 +203,12 @@ def test_a_target_put_on_anew_is_found_from_one_point() -> None:
 
 def test_gravity_where_it_was_not_learnt_is_uncertain() -> None:
     robot = kr270("full", ("base", "tool"))
-    heavy = replace(slim(), gravity=Gravity((Mass("arm"), Mass("payload"))))
+    heavy = replace(slim(), gravity=Gravity((Mass("arm"),), payload=Payload(5.0)))
     q = poses_of(robot, 20, 5)
-    empty, full = np.zeros(len(q)), np.ones(len(q))
-    unloaded = Knowledge.of_plan(robot, heavy, q, load=empty)
-    mixed_loads = Knowledge.of_plan(robot, heavy, q, load=np.where(np.arange(len(q)) % 2, full, empty))
+    empty, full = np.zeros(len(q)), np.full(len(q), 5.0)
+    unloaded = Knowledge.of_plan(robot, heavy, q, payload=empty)
+    mixed_loads = Knowledge.of_plan(robot, heavy, q, payload=np.where(np.arange(len(q)) % 2, full, empty))
     test = poses_of(robot, 5, 6)
-    loaded = [k.accuracy(test, load=np.ones(5)).value for k in (unloaded, mixed_loads)]
+    loaded = [k.accuracy(test, payload=5.0).value for k in (unloaded, mixed_loads)]
     assert loaded[1] < 0.5 * loaded[0]
-    assert unloaded.accuracy(test, load=np.zeros(5)).value < loaded[0]
+    assert unloaded.accuracy(test, payload=0.0).value < loaded[0]

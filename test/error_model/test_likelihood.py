@@ -11,6 +11,7 @@ from fits import problem_of, simulated, total_covariance, unknown, ur10e
 from robots import random_configurations
 
 from calib_planner.error_model import ErrorModel, Placement, typical
+from calib_planner.identification.doubt import part_of
 from calib_planner.identification.estimation import _Work, fit_error_model
 from calib_planner.identification.left_out import left_out
 from calib_planner.identification.likelihood import (
@@ -19,10 +20,12 @@ from calib_planner.identification.likelihood import (
     by_coefficients,
     dense,
     derivatives,
+    exchange,
     maximise,
     penalty,
     scale_covariance,
     unknown_scales,
+    updatable,
     with_uncertain_scales,
 )
 
@@ -149,6 +152,51 @@ def test_what_uncertain_scales_add_is_the_slope_of_the_estimate(
     np.testing.assert_allclose(added, expected, atol=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("targets", [1, 2])
+def test_visits_that_come_go_and_lose_weight_are_the_same_as_solving_anew(targets: int) -> None:
+    whole = problem_of(20, targets, missing=((4, 0),))
+    some, doubt = np.arange(14), np.zeros((17, targets))
+    doubt[5] = 1e-6
+    chosen = np.array([*range(8), 10, *range(12, 20)])
+
+    def part(rows: np.ndarray, doubt: np.ndarray | None) -> LinearProblem:
+        parts = {n: p[rows] for n, p in whole.parts.items()}
+        parts |= {} if doubt is None else {"doubt": part_of(doubt)}
+        return replace(whole, y=whole.y[rows], columns=whole.columns[rows], parts=parts, seen=whole.seen[rows])
+
+    start = updatable(dense(part(some, None)))
+    changed = exchange(start, part(chosen, doubt), np.where(chosen < 14, chosen, -1))
+    fresh = part(chosen, doubt)
+    fresh.__dict__["basis"] = start.problem.basis  # log|S| depends on it
+    anew = by_coefficients(fresh)
+    assert changed.value == pytest.approx(anew.value, rel=1e-7)
+    rows = np.random.default_rng(0).standard_normal((fresh.y.size, 2)) * fresh.seen.reshape(-1, 1)
+    pairs = [
+        (changed.coefficients, anew.coefficients),
+        (changed.weighted, anew.weighted),
+        (changed.blocks, anew.blocks),
+        (changed.squares, anew.squares),
+        (changed.pulls, anew.pulls),
+        (changed.posterior(), anew.posterior()),
+        (changed.project(rows), anew.project(rows)),
+        (changed.coefficients_of(rows), anew.coefficients_of(rows)),
+    ]
+    for a, b in pairs:
+        np.testing.assert_allclose(a, b, atol=2e-6 * np.abs(b).max())
+
+
+def test_a_visit_that_alone_tells_a_direction_cannot_be_taken_away() -> None:
+    start = updatable(dense(problem_of(3, 1, "flat")))
+    problem = start.problem
+    rows = np.arange(2)
+    parts = {n: p[rows] for n, p in problem.parts.items()}
+    less = replace(
+        problem, y=problem.y[rows], columns=problem.columns[rows], parts=parts, seen=problem.seen[rows]
+    )
+    with pytest.raises(np.linalg.LinAlgError):
+        exchange(start, less, rows)
+
+
 # ── left out ─────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -187,7 +235,7 @@ def test_a_visit_that_alone_tells_a_direction_has_no_left_out_residual() -> None
     points = robot.positions(q)
     model = replace(ErrorModel.paper(3e-5), placement=Placement("flat"))
     some = robot.with_parameters("wrist_2_joint.rz,shoulder_pan_joint.rz")
-    work = _Work(some, type(data)(robot.joint_names, q, points), model, None)
+    work = _Work(some, type(data)(robot.joint_names, q, points), model)
     found = left_out(dense(work.linearised()))
     assert np.isfinite(found.scores).all() and found.usable[:5].all()
 

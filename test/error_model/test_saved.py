@@ -14,6 +14,7 @@ from calib_planner.error_model import (
     ErrorModel,
     Gravity,
     Mass,
+    Payload,
     Placement,
     Prior,
     from_mapping,
@@ -28,10 +29,15 @@ MODELS = {
     "paper": lambda: ErrorModel.paper(3e-5),
     "masses": lambda: typical(
         Isotropic(1e-5),
-        gravity=Gravity((Mass("arm", 2, (0.1, 0.0, 0.2), 0.5), Mass("payload")), (0.0, 1.0, 0.0)),
+        gravity=Gravity(
+            (Mass("arm", 2, (0.1, 0.0, 0.2), 0.5), Mass("hand")),
+            (0.36, 0.48, 0.8),
+            Payload(2.5, (0.0, 0.01, 0.1)),
+        ),
         placement=Placement(stated=Prior(("d1",), [0.5], [1e-4])),
         estimate_scale=True,
     ),
+    "vertical": lambda: typical(gravity=Gravity(vertical=(0.0, -1.0, 1.0))),
     "without": lambda: typical().without("short").without("gravity").with_values({"floor": 1.5e-5}, "estimated"),
 }
 
@@ -41,6 +47,12 @@ def test_yaml_and_pickle_give_it_back(make: Callable[[], ErrorModel]) -> None:
     model = make()
     assert from_mapping(yaml.safe_load(yaml.safe_dump(to_mapping(model)))) == model
     assert pickle.loads(pickle.dumps(model)) == model
+
+
+def test_files_from_before_payloads_are_read() -> None:
+    data = to_mapping(typical())
+    del data["gravity"]["payload"], data["gravity"]["vertical"]
+    assert from_mapping(data) == typical()
 
 
 def test_a_tracker_comes_back_with_its_station() -> None:
@@ -67,6 +79,11 @@ def spoil(data: dict[str, Any], path: str, value: object) -> None:
         ("points/floor", None, "points.floor"),
         ("points/noise", {"kind": "sonar"}, "sonar"),
         ("gravity/masses", [{"name": "a", "kg": 3}], "kg"),
+        ("gravity/masses", [{"name": "payload"}], "payload"),
+        ("gravity/payload", {"mass": 0.0, "xyz": [0, 0, 0]}, "payload.mass"),
+        ("gravity/payload", {"mass": 1.0}, "payload.xyz"),
+        ("gravity/payload", 3.0, "payload"),
+        ("gravity/vertical", [0, 0, 0], "vertical"),
         ("joint_functions/components", ["rough"], "rough"),
         ("scales/floor/value", -1.0, "floor"),
         ("scales/floor", 3.0, "error_model"),

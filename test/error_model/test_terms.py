@@ -15,6 +15,7 @@ from calib_planner.error_model import (
     Gravity,
     JointFunctions,
     Mass,
+    Payload,
     Placement,
     Points,
     Poses,
@@ -135,10 +136,13 @@ def test_parts_of_one_mass_share_coefficients_and_the_payload_follows_the_visit(
     expected = 0.25 * each[1]
     expected[:, :2] += 0.75 * each[0]
     np.testing.assert_allclose(both._moments(poses), expected, atol=1e-15)
-    payload, load = Gravity((Mass("payload", None, (0.0, 0.0, 0.1)),)), np.array([0.0, 0.5, 1.0])
-    np.testing.assert_allclose(
-        payload._moments(replace(poses, load=load)), payload._moments(poses) * load[:, None], atol=1e-15
-    )
+    alone = Gravity((Mass("hand", None, (0.0, 0.0, 0.1)),))._moments(poses)
+    loaded, masses = Gravity(parts, payload=Payload(4.0, (0.0, 0.0, 0.1))), np.array([0.0, 2.0, 6.0])
+    count = loaded.size(robot) - len(robot.joint_names)
+    np.testing.assert_allclose(loaded._moments(poses)[:, count:], alone, atol=1e-15)
+    moments = loaded._moments(replace(poses, payload=masses))
+    np.testing.assert_allclose(moments[:, :count], both._moments(poses), atol=1e-15)
+    np.testing.assert_allclose(moments[:, count:], alone * np.array([0.0, 0.5, 1.5])[:, None], atol=1e-15)
 
 
 def test_masses_stand_at_elbow_wrist_and_tip() -> None:

@@ -10,8 +10,7 @@ from fits import NOTHING, ur10e
 from robots import mixed, random_configurations, repeats
 
 from calib_planner import Robot
-from calib_planner.error_model import ErrorModel, Gravity, Mass, Placement, Poses, Prior, Truth, typical
-from calib_planner.error_model.gravity import PAYLOAD
+from calib_planner.error_model import ErrorModel, Gravity, Payload, Placement, Poses, Prior, Truth, typical
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
 from calib_planner.tracker import LaserTracker
@@ -174,7 +173,7 @@ def test_a_series_comes_on_top_of_what_the_joints_do(paper: bool, harmonics: int
         for n, (a, b) in enumerate(series[j].T):
             wanted[:, j] += a * np.cos(orders[n] * x[:, j]) + b * np.sin(orders[n] * x[:, j])
     off = more.actual(q) - truth.actual(q)
-    np.testing.assert_allclose(off, wanted * joint_units(robot), atol=1e-14)
+    np.testing.assert_allclose(off, wanted, atol=1e-14)
     assert more.model.gravity == truth.model.gravity and more.model.values.get("smooth.length") == 1.0
 
 
@@ -189,13 +188,14 @@ def test_other_targets_keep_the_rest() -> None:
 
 def test_the_payload_of_a_visit() -> None:
     robot = ur10e()
-    gravity = Gravity((Mass(PAYLOAD),))
+    gravity = Gravity(payload=Payload(4.0))
     model = replace(typical(), gravity=gravity, joint_functions=None)
     truth = Truth.draw(robot, model, np.random.default_rng(1), {})
     q = random_configurations(robot, 3)
-    off = [truth.actual(q, load=np.full(3, share)) - q for share in (0.0, 0.5, 1.0)]
-    assert not off[0].any()
-    np.testing.assert_allclose(off[1], 0.5 * off[2], atol=1e-15)
+    off = [truth.actual(q, payload=np.full(3, mass)) - truth.actual(q, payload=0.0) for mass in (2.0, 4.0)]
+    assert off[0].any()
+    np.testing.assert_allclose(off[0], 0.5 * off[1], atol=1e-15)
+    np.testing.assert_array_equal(truth.actual(q), truth.actual(q, payload=4.0))
 
 
 def test_sizes_are_what_the_terms_move_the_targets_by() -> None:

@@ -43,8 +43,8 @@ def reseated(seed: int):
     sets = []
     for k in range(2):
         rng = np.random.default_rng([seed, k])
-        seat = cell.truth.target_offsets + rng.normal(0, 2e-3, (1, 3))
-        moved = SimulatedCell(cell.truth.with_targets(seat), {}, SIGMA)
+        seat = cell.truth.robot.target_offsets + rng.normal(0, 2e-3, (1, 3))
+        moved = SimulatedCell(cell.truth.robot.with_targets(seat), {}, SIGMA)
         q = random_configurations(asked, 15, seed + 500 + k)
         points = moved.truth.positions(q)
         sets.append(Measurements(asked.joint_names, q, points + SIGMA * rng.standard_normal(points.shape)))

@@ -80,7 +80,7 @@ def bumped(**options):
 def reseated():
     cell, asked = placed_cell(1, "offsets")
     data = bare(cell.measure(random_configurations(asked, 40, 1), 1, 1))
-    seat = cell.truth.target_offsets + np.array([[0, 0, 0], [4e-4, 0, 0], [0, 0, 0]])
+    seat = cell.truth.robot.target_offsets + np.array([[0, 0, 0], [4e-4, 0, 0], [0, 0, 0]])
     moved = cell.truth.with_targets(seat).positions(data.q) - cell.truth.positions(data.q)
     points = data.p + np.where(np.arange(40)[:, None, None] < 20, 0.0, moved)
     return solved(bare(data, points), asked, starts=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from robots import mixed
 
-from calib_planner import FileFormatError, Measurements, Robot
+from calib_planner import FileFormatError, InputError, Measurements, Robot
 from calib_planner.io import (
     csv,
     read_configurations,
@@ -22,6 +23,7 @@ from calib_planner.io import (
     write_configurations,
     write_measurements,
 )
+from calib_planner.measurements import RejectedPoint
 
 PLANAR = Robot.load("planar_2r")
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -43,7 +45,8 @@ def measurements(draw: st.DrawFn) -> Measurements:
     std = None
     if draw(st.booleans()):
         std = draw(hnp.arrays(float, points.shape, elements=st.floats(1e-300, 1e10)))
-    return Measurements(PLANAR.joint_names, q, points, std)
+    payload = draw(hnp.arrays(float, n, elements=st.floats(0.0, 1e10))) if draw(st.booleans()) else None
+    return Measurements(PLANAR.joint_names, q, points, std, payload)
 
 
 @settings(max_examples=60, deadline=None)
@@ -59,6 +62,27 @@ def test_measurements_come_back_to_the_bit(data: Measurements) -> None:
     assert (back.data.std is None) == (data.std is None)
     if data.std is not None:
         np.testing.assert_array_equal(np.asarray(back.data.std)[data.seen], np.asarray(data.std)[data.seen])
+    assert (back.data.payload is None) == (data.payload is None)
+    if data.payload is not None:
+        np.testing.assert_array_equal(back.data.payload, data.payload)
+
+
+def test_a_payload_stays_with_its_row() -> None:
+    q, points = np.arange(6.0).reshape(3, 2), np.arange(9.0).reshape(3, 1, 3)
+    data = Measurements(("q1", "q2"), q, points, payload=[0.0, 2.5, 10.0])
+    rejected = [RejectedPoint(1, 1, "", 9.0, 1.0)]
+    for other in (data.without(rejected), data.in_order_of(("q2", "q1"))):
+        np.testing.assert_array_equal(other.payload, data.payload)
+    np.testing.assert_array_equal(data.select([2, 0]).payload, [10.0, 0.0])
+    for wrong in ([1.0, 2.0], [1.0, -2.0, 3.0], [1.0, np.nan, 3.0]):
+        with pytest.raises(InputError, match="payload"):
+            Measurements(("q1", "q2"), q, points, payload=wrong)
+
+
+def test_a_joint_may_be_named_like_the_column_of_payloads(tmp_path: Path) -> None:
+    robot = replace(PLANAR, joint_names=("q1", "payload"))
+    data = read_measurements(put(tmp_path, "q1,payload,x1,y1,z1\n0.1,-0.2,1,2,3\n"), robot).data
+    assert data.payload is None and data.q.tolist() == [[0.1, -0.2]]
 
 
 @settings(max_examples=40, deadline=None)
@@ -119,6 +143,9 @@ BAD = {
     "half a target": ("q1,q2,x1,y1\n1,2,3,4\n", "no column z1", "x1, y1, z1"),
     "target skipped": ("q1,q2,x1,y1,z1,x3,y3,z3\n1,2,3,4,5,6,7,8\n", "no column x2", "x2, y2, z2"),
     "nearly a name": ("q1,q2,x1,y1,z1,X2\n1,2,3,4,5,6\n", "column 'X2'", "rename it"),
+    "payload below zero": ("q1,q2,x1,y1,z1,payload\n1,2,3,4,5,-1\n", "line 2, column payload", "0 kg or more"),
+    "payload empty": ("q1,q2,x1,y1,z1,payload\n1,2,3,4,5,\n", "line 2, column payload", "fill it"),
+    "payload infinite": ("q1,q2,x1,y1,z1,payload\n1,2,3,4,5,inf\n", "line 2, column payload", "finite"),
     "word": ("q1,q2,x1,y1,z1\n1,2,3,4,5\n1,two,3,4,5\n", "line 3, column q2", "'two'"),
     "decimal comma": ("q1;q2;x1;y1;z1\n1;2,5;3;4;5\n", "line 2, column q2", "decimal point"),
     "nan": ("q1,q2,x1,y1,z1\n1,2,nan,4,5\n", "line 2, column x1", "leave the cell empty"),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib_planner import PlanProblem, Robot, plan
-from calib_planner.planning import InformationModel, Search, covariance, error_variance
+from calib_planner.error_model import covariance, error_variance
+from calib_planner.planning import InformationModel, Search
 from calib_planner.tracker import Isotropic
 
 PAIRS = ["l1,l2", "dq1,dq2"]
@@ -27,7 +28,7 @@ def random_q(count, seed):
 
 def variance(robot, q, q0):
     """ρ0²/σ² of eq. (14) by the general machinery."""
-    return error_variance(robot.jacobian(q0)[0], information(robot, q))
+    return error_variance(robot.jacobian(q0)[0], *covariance(information(robot, q)))
 
 
 def equation_18(q2, q20):

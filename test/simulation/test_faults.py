@@ -174,11 +174,11 @@ def test_a_fault_of_messages_leaves_their_values_alone(tour: Tour) -> None:
 def test_transmission_errors(tour: Tour) -> None:
     world = World(CELL, Faults(transmission_error=2e-4, transmission_harmonics=4), 5)
     turn = np.linspace(-np.pi, np.pi, 400, endpoint=False)
-    phi = world.transmission.actual(np.tile(turn[:, None], 6)) - turn[:, None]
+    phi = world.truth.actual(np.tile(turn[:, None], 6)) - turn[:, None]
     assert np.allclose(np.sqrt(np.mean(phi**2, axis=0)), 2e-4) and np.allclose(phi.mean(axis=0), 0, atol=1e-12)
     times, points = stream(list(play(world, tour, start=START)), 1)
     q = np.array([tour.at(t).joints(t) for t in times])
-    assert np.allclose(points, CELL.truth.positions(world.transmission.actual(q))[:, 0], atol=1e-9)
+    assert np.allclose(points, CELL.truth.robot.positions(world.truth.actual(q))[:, 0], atol=1e-9)
     assert np.array_equal(stream(list(play(world, tour, start=START)), 0)[1], stream(messages(tour), 0)[1])
 
 
@@ -218,7 +218,7 @@ def test_a_target_seated_elsewhere(tour: Tour) -> None:
     _, second, _ = added(tour, target=2, reseat_at=3, reseat_by=2e-4)
     assert np.abs(second - extra).max() > 1e-5
     # One vector in the tip's frame: the offset that explains one standstill explains all.
-    truth, q = CELL.truth, np.array([tour.at(t).joints(t) for t in times[last >= 3]])
+    truth, q = CELL.truth.robot, np.array([tour.at(t).joints(t) for t in times[last >= 3]])
     free = truth.with_parameters(["target_1.x", "target_1.y", "target_1.z"])
     jacobian = free.jacobian(q)[:, :3].reshape(-1, 3)
     offset = np.linalg.lstsq(jacobian, extra[last >= 3].ravel(), rcond=None)[0]
