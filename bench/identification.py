@@ -1,7 +1,7 @@
-"""Identification: speed and held-out error against FIGAROH, and held-out error on a measured UR10.
+"""Identification: speed and held-out error against FIGAROH. (Measured robots: bench/error_model.py.)
 
-    python bench/identification.py [--sections figaroh kuka random sweeps] [--figaroh PYTHON]
-                                   [--data ../shared/data] [--json FILE] [--cells 3] [--repeats 5] [--seeds 20]
+    python bench/identification.py [--sections figaroh kuka] [--figaroh PYTHON] [--data ../shared/data]
+                                   [--json FILE] [--cells 3] [--repeats 5]
 
 ``figaroh``  Simulated cells around the UR10 of ``ur10_tracker/ur10.urdf``: all placement errors (0.5 mm, 1 mrad),
              base and three targets unknown, 100 configurations, 0.03 mm of noise. The same file to both sides;
@@ -11,15 +11,9 @@
              the variable FIGAROH_PYTHON names its interpreter; without it only ours is measured. Its four ways
              are told in ``figaroh_identification.py``.
 ``kuka``     The same size and errors with the shipped KR-270, ours only.
-``random``   100 random rows of ``random_poses.csv`` fitted, tracker and target unknown, all its others predicted.
-``sweeps``   Rows of ``joint_sweeps.csv`` predicted: from 100 random rows of ``random_poses.csv``, and from 100
-             random rows of its own.
 
-Ours is measured as it comes, with a prior (typical manufacturing errors), with the robust loss, and with both;
-on the measured robot also without joint corrections (``geometry``), which is what a URDF can hold.
-The measured rows carry the tracker's standard deviations, ten times smaller than what the model leaves; they are
-also fitted as plain least squares, equal weights and no discrepancy. The table goes to stderr; the figures, JSON,
-to FILE or stdout.
+Ours is measured as the paper has it, the same least squares as FIGAROH's, and as it comes, with all terms of the
+error model. The table goes to stderr; the figures, JSON, to FILE or stdout.
 """
 
 from __future__ import annotations
@@ -39,28 +33,23 @@ import numpy as np
 
 from calib_planner import IdentificationProblem, Robot, identify
 from calib_planner.arrays import FloatArray
-from calib_planner.errors import NotEnoughDataError
-from calib_planner.identification import Estimate, typical_prior
+from calib_planner.error_model import ErrorModel
+from calib_planner.identification import Estimate
 from calib_planner.io import read_measurements, write_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.robot import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 ROOT = Path(__file__).resolve().parents[1]
-SECTIONS = ("figaroh", "kuka", "random", "sweeps")
+SECTIONS = ("figaroh", "kuka")
 TARGETS = np.array([[0.05, 0.02, 0.12], [-0.06, 0.04, 0.10], [0.01, -0.07, 0.14]])
 LENGTH, ANGLE, SIGMA = 5e-4, 1e-3, 3e-5
 FITTED, HELD_OUT = 100, 200
-FLAT = 3e-4
-"""Standard deviation given to every measured coordinate where weights are equal [m]."""
-FIGURES = ("mean_mm", "rms_mm", "rank", "used", "converged", "seconds")
 
 
-def ways(robot: Robot) -> dict[str, dict[str, Any]]:
+def ways() -> dict[str, dict[str, Any]]:
     """Ways of identifying: name → further arguments of the problem."""
-    prior = {"prior": typical_prior(robot)}
-    robust = {"loss": "robust"}
-    return {"ours": {}, "ours, prior": prior, "ours, robust": robust, "ours, prior, robust": prior | robust}
+    return {"ours": {"error_model": ErrorModel.paper()}, "ours, all terms": {}}
 
 
 # ── simulated cells ──────────────────────────────────────────────────────────────────────────────────
@@ -138,7 +127,7 @@ def one_cell(robot: Robot, seed: int, urdf: Path | None, python: str | None, rep
         path = Path(name) / "fit.csv"
         write_measurements(path, fitted)
         write_measurements(path.with_name("held_out.csv"), truth)
-        mine = ways(question)
+        mine = ways()
         before = {name: timed(question, path, options, repeats) for name, options in mine.items()}
         theirs = figaroh(urdf, path.parent, truth, python) if urdf and python else {}
         after = {name: timed(question, path, options, repeats) for name, options in mine.items()}
@@ -150,7 +139,7 @@ def one_cell(robot: Robot, seed: int, urdf: Path | None, python: str | None, rep
         found = found_by(question, data, options)
         run[name] = dict(zip(keys, times, strict=True)) | {"first_seconds": before[name][0, 0]}
         run[name] |= {
-            "error_m": mean_error(found.calibrated.positions(truth.q), truth),
+            "error_m": mean_error(found.positions(truth.q), truth),
             "parameters": found.observability.rank,
         }
         run[name] |= {"used": found.points.used, "iterations": found.fit.iterations, "status": found.fit.status}
@@ -189,79 +178,6 @@ def show_times(name: str, result: dict[str, Any]) -> None:
         print(text, file=sys.stderr)
 
 
-# ── the measured robot ───────────────────────────────────────────────────────────────────────────────
-
-
-def predicted(estimate: Estimate, data: Measurements) -> FloatArray:
-    """(N,) distances to the measured points [mm]."""
-    return np.asarray(1e3 * np.linalg.norm(data.p - estimate.positions(data.q), axis=2)[:, 0])
-
-
-def measured(folder: Path, sections: list[str], seeds: int) -> list[dict[str, Any]]:
-    """One entry per test, level and estimator: figures over the seeds [mm]."""
-    nominal = Robot.load(folder / "ur10.urdf")
-    poses = read_measurements(folder / "random_poses.csv", nominal).data
-    sweeps = read_measurements(folder / "joint_sweeps.csv", nominal).data
-    tests = {"random": [("random→random", poses, poses)], "sweeps": []}
-    tests["sweeps"] = [("random→sweeps", poses, sweeps), ("sweeps→sweeps", sweeps, sweeps)]
-    result = []
-    for test, source, other in (t for s in ("random", "sweeps") if s in sections for t in tests[s]):
-        for level in ("offsets", "full"):
-            robot = nominal.with_parameters(level, ("base", "tool"))
-            geometry = {"joint_corrections": "off"}
-            plain = {
-                "plain least squares": {"sigma": FLAT, "discrepancy": "off"} | geometry,
-                "geometry": geometry,
-            }
-            for name, options in (plain | ways(robot)).items():
-                entry: dict[str, Any] = {"test": test, "level": level, "estimator": name}
-                runs = [_one(robot, source, other, seed, options) for seed in range(seeds)]
-                done = [run for run in runs if run]
-                entry["refused"] = len(runs) - len(done)
-                result.append(entry | {key: [run[key] for run in done] for key in FIGURES})
-    return result
-
-
-def _one(
-    robot: Robot, source: Measurements, other: Measurements, seed: int, options: dict[str, Any]
-) -> dict[str, float] | None:
-    """One random choice of rows to fit, which take no part in the test; ``None`` if identify refuses them."""
-    chosen = np.random.default_rng(seed).choice(len(source), FITTED, replace=False)
-    began = time.perf_counter()
-    try:
-        found = identify(IdentificationProblem(robot, source.select(chosen), **options))
-    except NotEnoughDataError:
-        return None
-    seconds = time.perf_counter() - began
-    test = other.select(np.setdiff1d(np.arange(len(other)), chosen)) if other is source else other
-    errors = predicted(found, test)
-    rms = float(np.sqrt(np.mean(errors**2)))
-    figures = (
-        float(errors.mean()),
-        rms,
-        found.observability.rank,
-        found.points.used,
-        int(found.fit.status != "not_converged"),
-        seconds,
-    )
-    return dict(zip(FIGURES, figures, strict=True))
-
-
-def show_errors(entries: list[dict[str, Any]]) -> None:
-    """Mean over the seeds [smallest–largest]; how often identify refused, and how often its iteration settled."""
-    head = f"{'fitted→predicted':<16} {'level':<8} {'estimator':<20} {'refused':>7} {'settled':>7}"
-    print(head + f" {'rank':>4} {'used':>4} {'mean mm':>23} {'rms mm':>23} {'ms':>6}", file=sys.stderr)
-    for e in entries:
-        text = f"{e['test']:<16} {e['level']:<8} {e['estimator']:<20} {e['refused']:7d}"
-        if not e["seconds"]:
-            print(text, file=sys.stderr)
-            continue
-        text += f" {sum(e['converged']):7d} {median(e['rank']):4.0f} {median(e['used']):4.0f}"
-        for key in ("mean_mm", "rms_mm"):
-            text += f"    {np.mean(e[key]):.4f} [{min(e[key]):.3f}–{max(e[key]):.3f}]"
-        print(f"{text} {1e3 * median(e['seconds']):6.1f}", file=sys.stderr)
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -271,10 +187,9 @@ def main() -> None:
     parser.add_argument("--figaroh", default=os.environ.get("FIGAROH_PYTHON", sys.executable))
     parser.add_argument("--cells", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--seeds", type=int, default=20)
     args = parser.parse_args()
-    if min(args.cells, args.repeats, args.seeds) < 1:
-        parser.error("--cells, --repeats and --seeds: at least 1")
+    if min(args.cells, args.repeats) < 1:
+        parser.error("--cells and --repeats: at least 1")
     folder, result = args.data / "ur10_tracker", {}
     if not folder.is_dir() and args.sections != ["kuka"]:
         print(f"identification: no measured data at {args.data}: only kuka needs none", file=sys.stderr)
@@ -289,9 +204,6 @@ def main() -> None:
     if "kuka" in args.sections:
         result["kuka"] = compare(Robot.load("kuka_kr270"), None, None, args.cells, args.repeats)
         show_times("KR-270", result["kuka"])
-    if {"random", "sweeps"} & set(args.sections):
-        result["ur10_measured"] = measured(folder, args.sections, args.seeds)
-        show_errors(result["ur10_measured"])
     text = json.dumps(result, indent=1)
     if args.json:
         args.json.write_text(text + "\n", encoding="utf-8")
