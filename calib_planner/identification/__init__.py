@@ -21,7 +21,12 @@ from calib_planner.identification.estimate import (
     Verdict,
     without_noise,
 )
-from calib_planner.identification.estimation import ModelEstimate, fit_error_model
+from calib_planner.identification.estimation import (
+    ModelEstimate,
+    PlacementAlone,
+    fit_error_model,
+    placement_alone,
+)
 from calib_planner.identification.problem import LOSSES, IdentificationProblem
 from calib_planner.identification.solver import check_units, identify, place_nominal, start_robot
 from calib_planner.identification.term_gain import TermGain

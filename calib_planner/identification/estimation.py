@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -50,7 +51,7 @@ from calib_planner.identification.likelihood import (
 )
 from calib_planner.identification.registration import place, tip_poses
 from calib_planner.identification.term_gain import TermGain, term_gains
-from calib_planner.measurements import Measurements
+from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.robot import BASE_PARAMETERS, Robot, target_parameters
 from calib_planner.tracker import Isotropic
 
@@ -167,6 +168,11 @@ class _Work:
         self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
         self.rounds, self.converged, self.moved = 0, False, 0.0
         self.shifted = np.zeros(data.seen.shape)
+
+    @cached_property
+    def groups(self) -> IntArray:
+        """(N,) number of each visit's configuration: what is left out together."""
+        return configuration_labels(self.data.q)
 
     def linearised(self) -> LinearProblem:
         """(M1) at the state."""
@@ -297,9 +303,9 @@ class _Work:
         """Without the terms that do not better the left-out score; term → gain."""
         gains: dict[str, float] = {}
         while True:
-            score = left_out(solution).score
+            score = left_out(solution, self.groups).score
             trials = {t: maximise(_without(solution.problem, t), 6) for t in _optional(solution.problem.model)}
-            found = {t: score - left_out(trial).score for t, trial in trials.items()}
+            found = {t: score - left_out(trial, self.groups).score for t, trial in trials.items()}
             gains |= found
             if not found or min(found.values()) > 0.0:
                 return solution, gains
@@ -381,7 +387,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
             solution = whole.reconsider(solution, 2, 0)
         work = whole
     covariance = _covariance(solution, scales)
-    left = left_out(solution)
+    left = left_out(solution, work.groups)
     return ModelEstimate(
         knowledge=_knowledge(work, covariance, _hidden(solution.problem)),
         left_out=left,
@@ -421,9 +427,48 @@ def _knowledge(work: _Work, covariance: FloatArray, hidden: FloatArray) -> Knowl
 
 def _surprise(left: LeftOut) -> float:
     """Sum of the squared left-out residuals of visits without doubts over its expectation; 1: there are none."""
-    sound = ~left.doubted.any(axis=1)
+    sound = np.bincount(left.groups, weights=left.doubted.any(axis=1), minlength=len(left.squares)) == 0.0
     freedom = float(left.freedom[sound].sum())
     return float(left.squares[sound].sum()) / freedom if freedom > 0.0 else 1.0
+
+
+# ── what a file of lengths and angles can hold ───────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementAlone:
+    """A fit of the parameters alone, without gravity and joint functions: what a URDF can hold.
+
+    Attributes:
+        knowledge: Robot, model without these terms, deviations and their covariance.
+        left_out: (M4): how well such a file predicts.
+        converged: Whether the predictions stood still at the end.
+    """
+
+    knowledge: Knowledge
+    left_out: LeftOut
+    converged: bool
+
+
+def placement_alone(found: ModelEstimate) -> PlacementAlone:
+    """The parameters that predict best where gravity and joint functions are nobody's business.
+
+    They are not those of the whole model: they take over what they can of the terms that are off. What they
+    cannot has to be in visits and points, whose scales are found anew. Points that were doubted stay so.
+    """
+    problem, origin = found.solution.problem, found.origin
+    model, robot = problem.model, problem.robot
+    if model.gravity is None and model.joint_functions is None:
+        known = replace(found.knowledge, robot=robot, coefficients=origin.coefficients)
+        return PlacementAlone(known, found.left_out, found.converged)
+    alone = replace(model, gravity=None, joint_functions=None)
+    work = _Work(robot, origin.data, alone)
+    count = len(robot.parameter_names)
+    work.state = _State(origin.coefficients[:count], alone, found.doubt)
+    solution = work.settle(MOST_ROUNDS)
+    covariance = _covariance(solution, scale_covariance(solution))
+    known = _knowledge(work, covariance, _hidden(solution.problem))
+    return PlacementAlone(known, left_out(solution, work.groups), work.converged)
 
 
 # ── an update ────────────────────────────────────────────────────────────────────────────────────────
@@ -492,7 +537,7 @@ def _updated(
     if work.bends(solution):
         final = work.settle(2, 0)
         work.rounds += 1
-    left = left_out(final)
+    left = left_out(final, work.groups)
     surprise = _surprise(left)
     if not origin.surprise / OFF < surprise < origin.surprise * OFF:
         return None

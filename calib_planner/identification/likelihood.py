@@ -216,6 +216,10 @@ class Solution:
         """P · vectors, (N·m, n) → (N·m, n)."""
         raise NotImplementedError
 
+    def between(self, visits: IntArray) -> FloatArray:
+        """(k·m, k·m) the block of P for k ``visits`` [1/m²]."""
+        raise NotImplementedError
+
     def _reduced(self, vectors: FloatArray) -> FloatArray:
         """γ̂ and Λ^-½ û if ``vectors`` (N·m, n) had been measured: (rank + K, n)."""
         raise NotImplementedError
@@ -245,6 +249,10 @@ class DenseSolution(Solution):
     def project(self, vectors: FloatArray) -> FloatArray:
         return self.projection @ vectors
 
+    def between(self, visits: IntArray) -> FloatArray:
+        rows = _rows(visits, self.problem.y.shape[1])
+        return self.projection[np.ix_(rows, rows)]
+
     def _reduced(self, vectors: FloatArray) -> FloatArray:
         flat = self.spread @ (self.carried.T @ vectors)
         return np.vstack([flat, self.problem.scaled_columns.T @ (self.projection @ vectors)])
@@ -271,6 +279,12 @@ class CoefficientSolution(Solution):
         turned = self._times(self.inverse, vectors)
         turned = turned - self.white @ (self.half @ (self.half.T @ (self.white.T @ turned)))
         return self._times(self.inverse.transpose(0, 2, 1), turned)
+
+    def between(self, visits: IntArray) -> FloatArray:
+        share = self.white[_rows(visits, self.problem.y.shape[1])] @ self.half
+        inner = np.eye(len(share)) - share @ share.T
+        turned = _blocks_times(self.inverse[visits].transpose(0, 2, 1), inner)
+        return _blocks_times(self.inverse[visits].transpose(0, 2, 1), turned.T).T
 
     def _times(self, blocks: FloatArray, vectors: FloatArray) -> FloatArray:
         n, m = self.problem.y.shape
@@ -301,6 +315,11 @@ class UpdatedSolution(Solution):
     def project(self, vectors: FloatArray) -> FloatArray:
         turned = self._times(vectors)
         return turned - self._times(self.rows @ (self.inverse @ (self.rows.T @ turned)))
+
+    def between(self, visits: IntArray) -> FloatArray:
+        rows = self.rows[_rows(visits, self.problem.y.shape[1])]
+        own = _blocks_times(self.precision[visits], np.eye(len(rows)))
+        return own - own @ (rows @ self.inverse @ rows.T) @ own
 
     def _times(self, vectors: FloatArray) -> FloatArray:
         n, m = self.problem.y.shape
@@ -456,6 +475,11 @@ def exchange(solution: UpdatedSolution, problem: LinearProblem, old: IntArray) -
     return _finished(
         problem, rows, precision, inverse, solution.log_determinant + float(np.log(shares).sum()), spread
     )
+
+
+def _rows(visits: IntArray, size: int) -> IntArray:
+    """Numbers of the coordinates of ``visits``, ``size`` each."""
+    return (size * visits[:, None] + np.arange(size)).ravel()
 
 
 def _blocks_times(blocks: FloatArray, matrix: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, Gravity, typical
 from calib_planner.identification import ModelEstimate, fit_error_model
-from calib_planner.identification.estimation import _Work
+from calib_planner.identification.estimation import _Work, placement_alone
 from calib_planner.identification.left_out import left_out
 from calib_planner.measurements import Measurements
 from calib_planner.tracker import Isotropic
@@ -187,6 +187,53 @@ def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> N
     (good, _), (distance, ratio) = fresh_errors(clean, data, 40), fresh_errors(found, data, 40)
     assert distance.mean() < 1.3 * good.mean()
     assert 0.75 < ratio < 1.4
+
+
+# ── placement alone, repetitions ─────────────────────────────────────────────────────────────────────
+
+
+def test_placement_alone_is_what_predicts_best_without_the_other_terms() -> None:
+    """Its left-out error is what it achieves, and less than the parameters of the whole model achieve."""
+    robot = ur10e(2)
+    data, _ = simulated(robot, {"gravity": 1e-3, "smooth.size": 3e-4}, 340, 2)
+    found = fit_error_model(unknown(robot), data.select(np.arange(40)), typical())
+    alone = placement_alone(found)
+    assert alone.converged and alone.knowledge.model.gravity is None
+    assert alone.knowledge.model.joint_functions is None
+
+    def achieved(deviations: FloatArray) -> float:
+        placed = alone.knowledge.robot
+        positions = placed.positions(data.q[40:], deviations)
+        return float(np.sqrt(np.mean(np.sum((positions - data.p[40:]) ** 2, axis=2))))
+
+    count = len(alone.knowledge.robot.parameter_names)
+    own = achieved(alone.knowledge.coefficients)
+    assert own < 0.9 * achieved(found.knowledge.coefficients[:count])
+    assert alone.left_out.rms == pytest.approx(own, rel=0.2)
+    assert alone.left_out.predicted_rms == pytest.approx(own, rel=0.3)
+    assert found.left_out.rms < 0.7 * alone.left_out.rms
+
+
+def test_placement_alone_is_the_fit_itself_where_there_is_nothing_else() -> None:
+    robot = ur10e(2)
+    data, _ = simulated(robot, {}, 20, 2)
+    found = fit_error_model(unknown(robot), data, ErrorModel.paper())
+    alone = placement_alone(found)
+    np.testing.assert_array_equal(alone.knowledge.coefficients, found.knowledge.coefficients)
+    assert alone.left_out is found.left_out
+
+
+def test_repetitions_do_not_make_the_left_out_error_kind() -> None:
+    """Three visits at each of few configurations of a robot with short joint functions."""
+    robot = ur10e(1)
+    data, _ = simulated(robot, {"short.size": 4e-4}, 160, 4)
+    rows = np.repeat(np.arange(25), 3)
+    points = data.p[rows] + np.random.default_rng(0).normal(0.0, 1e-5, (75, 1, 3))
+    found = fit_error_model(unknown(robot), Measurements(robot.joint_names, data.q[rows], points), typical())
+    distance, _ = fresh_errors(found, data, 25)
+    assert found.left_out.rms == pytest.approx(np.sqrt(np.mean(distance**2)), rel=0.25)
+    assert left_out(found.solution).rms < 0.3 * found.left_out.rms  # visit by visit
+    assert {t.name: t.kept for t in found.terms}["short"]
 
 
 # ── updates ──────────────────────────────────────────────────────────────────────────────────────────

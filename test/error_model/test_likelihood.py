@@ -200,30 +200,61 @@ def test_a_visit_that_alone_tells_a_direction_cannot_be_taken_away() -> None:
 # ── left out ─────────────────────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("form", [dense, by_coefficients])
-def test_left_out_residuals_are_those_of_a_refit_without_the_visit(
+@pytest.mark.parametrize("form", [dense, by_coefficients, lambda problem: updatable(dense(problem))])
+def test_left_out_residuals_are_those_of_a_refit_without_the_group(
     form: Callable[[LinearProblem], Solution],
 ) -> None:
-    problem = problem_of(10, 2, missing=((3, 1),))
-    found = left_out(form(problem))
-    for visit in (0, 3, 7):
-        rest = np.delete(np.arange(10), visit)
+    problem, groups = problem_of(10, 2, missing=((3, 1),)), np.array([0, 1, 1, 2, 3, 4, 5, 2, 6, 2])
+    found = left_out(form(problem), groups)
+    single = left_out(form(problem))
+    np.testing.assert_allclose(found.residuals[[0, 4]], single.residuals[[0, 4]], rtol=1e-9)
+    for group in (0, 1, 2, 5):
+        visits = np.flatnonzero(groups == group)
+        rest = np.flatnonzero(groups != group)
         parts = {n: p[rest] for n, p in problem.parts.items()}
         part = replace(
             problem, y=problem.y[rest], columns=problem.columns[rest], parts=parts, seen=problem.seen[rest]
         )
         without = form(part)
-        columns = problem.columns[visit]
-        residual = (problem.y[visit] - columns @ without.coefficients).reshape(-1, 3)
-        np.testing.assert_allclose(found.residuals[visit], residual, atol=1e-4 * np.abs(residual).max())
-        covariance = columns @ without.posterior() @ columns.T + problem.covariance[visit]
-        np.testing.assert_allclose(found.covariance[visit], covariance, atol=1e-4 * np.abs(covariance).max())
-        seen = problem.seen[visit] > 0
-        flat, own = residual.ravel()[seen], covariance[np.ix_(seen, seen)]
-        square = flat @ np.linalg.solve(own, flat)
-        assert found.squares[visit] == pytest.approx(square, rel=1e-4)
-        score = -0.5 * (square + np.linalg.slogdet(2.0 * np.pi * own)[1])
-        assert found.scores[visit] == pytest.approx(score, rel=1e-6)
+        columns = problem.columns[visits].reshape(-1, problem.columns.shape[2])
+        residual = problem.y[visits].ravel() - columns @ without.coefficients
+        np.testing.assert_allclose(found.residuals[visits].ravel(), residual, atol=1e-4 * np.abs(residual).max())
+        covariance = columns @ without.posterior() @ columns.T
+        m = problem.y.shape[1]
+        for k, visit in enumerate(visits):
+            own = slice(k * m, k * m + m)
+            covariance[own, own] += problem.covariance[visit]
+            expected = covariance[own, own]
+            np.testing.assert_allclose(found.covariance[visit], expected, atol=1e-4 * np.abs(expected).max())
+        seen = problem.seen[visits].ravel() > 0
+        flat, own_covariance = residual[seen], covariance[np.ix_(seen, seen)]
+        square = flat @ np.linalg.solve(own_covariance, flat)
+        assert found.squares[group] == pytest.approx(square, rel=1e-4)
+        assert found.freedom[group] == seen.sum()
+        score = -0.5 * (square + np.linalg.slogdet(2.0 * np.pi * own_covariance)[1])
+        assert found.scores[group] == pytest.approx(score, rel=1e-6)
+    assert found.usable.sum() == 19
+
+
+@pytest.mark.parametrize(("visits", "targets"), [(12, 1), (15, 3), (40, 1), (30, 2)])
+def test_how_far_the_left_out_rms_is_from_its_prediction_by_chance(visits: int, targets: int) -> None:
+    """Against the trace over all residuals, and against measurements drawn from the model."""
+    problem = problem_of(visits, targets)
+    solution = dense(problem)
+    found, m = left_out(solution), problem.y.shape[1]
+    whole = np.zeros((visits * m, visits * m))
+    for i in range(visits):
+        whole[i * m : i * m + m, i * m : i * m + m] = found.covariance[i]
+    apart = whole @ solution.projection @ whole
+    assert np.sqrt(found.spread.sum()) == pytest.approx(np.sqrt(2.0 * np.sum(apart**2)), rel=0.2)
+    rng = np.random.default_rng(0)
+    draws = np.linalg.cholesky(total_covariance(problem)) @ rng.standard_normal((visits * m, 2000))
+    sums = np.sum((whole @ (solution.projection @ draws)) ** 2, axis=0)
+    expected = found.usable.sum() * found.predicted_rms**2
+    assert np.mean(sums) == pytest.approx(expected, rel=0.1)
+    ratio, std = found.excess
+    assert ratio == pytest.approx(found.rms / found.predicted_rms)
+    assert std == pytest.approx(0.5 * np.std(sums) / expected, rel=0.25)
 
 
 def test_a_visit_that_alone_tells_a_direction_has_no_left_out_residual() -> None:
