@@ -258,10 +258,23 @@ class DenseSolution(Solution):
         return np.vstack([flat, self.problem.scaled_columns.T @ (self.projection @ vectors)])
 
     def _reduced_covariance(self) -> FloatArray:
-        scaled = self.problem.scaled_columns
-        cross = -self.spread @ (self.carried.T @ scaled)
-        own = np.eye(scaled.shape[1]) - scaled.T @ self.projection @ scaled
-        return np.block([[self.spread, cross], [cross.T, own]])
+        """From the singular values s of the whitened columns that F does not explain: 1/(1 + s²) along each.
+
+        I − Λ^½BᵀPBΛ^½ is the same, but a wide prior leaves a small difference of numbers near one.
+        """
+        problem, (n, m) = self.problem, self.problem.y.shape
+        inverse = np.linalg.inv(np.linalg.cholesky(problem.covariance))
+        flat, scaled = (
+            (inverse @ columns.reshape(n, m, -1)).reshape(n * m, -1)
+            for columns in (problem.flat_columns, problem.scaled_columns)
+        )
+        basis, triangle = np.linalg.qr(flat)
+        shared = basis.T @ scaled
+        _, values, vectors = np.linalg.svd(scaled - basis @ shared, full_matrices=False)
+        own = np.eye(scaled.shape[1]) - (vectors.T * (values**2 / (1.0 + values**2))) @ vectors
+        lever = np.linalg.solve(triangle, np.eye(len(triangle)))
+        cross = -lever @ shared @ own
+        return np.block([[lever @ lever.T - cross @ shared.T @ lever.T, cross], [cross.T, own]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -355,7 +355,7 @@ def _accuracy(problem: IdentificationProblem, known: Knowledge, calibrated: Robo
         return Accuracy(poses, nothing, nothing, nothing, problem.accuracy_frame, required)
     complete = np.where(blind, np.inf, known.accuracy(poses, problem.accuracy_frame).per_pose)
     told = known.predict(poses)
-    own = np.sqrt(np.trace(told.parameters, axis1=2, axis2=3).mean(axis=1))
+    own = np.sqrt(np.maximum(np.trace(told.parameters, axis1=2, axis2=3).mean(axis=1), 0.0))  # rounding
     missed = np.sqrt(np.sum((told.mean - calibrated.positions(poses)) ** 2, axis=2).mean(axis=1))
     return Accuracy(
         test_poses=poses,
