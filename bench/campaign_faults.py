@@ -96,7 +96,7 @@ def given(faults: Faults, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
     """Parameters of each node."""
     usual = asdict(Faults())
     off = {name: value for name, value in asdict(faults).items() if value != usual[name]}
-    simulator = {"robot": ROBOT, "seed": seed, "joint_speed": 12.0, "dwell": 0.5}
+    simulator = {"robot": ROBOT, "error_model": "paper", "seed": seed, "joint_speed": 12.0, "dwell": 0.5}
     identifier = {"robot": ROBOT, "plan_topic": f"{NAME}/plan", "keep_measurements": True}
     campaign = {
         "robot": ROBOT,

@@ -8,7 +8,6 @@ noise, fresh draws.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,7 +20,14 @@ from calib_planner.arrays import FloatArray, plain
 from calib_planner.error_model import covariance, error_variance
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
-from calib_planner.io import make_folder, write_estimate, write_measurements, write_plan, write_text
+from calib_planner.io import (
+    make_folder,
+    read_error_model,
+    write_estimate,
+    write_measurements,
+    write_plan,
+    write_text,
+)
 from calib_planner.planning import Callback, InformationModel, Plan, PlanProblem, Search, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
@@ -31,6 +37,8 @@ from calib_planner.units import MILLI_UNIT, milli, signed
 RANDOM_PLANS = 100
 """Random plans that stand for chance: one alone may be lucky."""
 ROBOT = "kuka_kr270"
+ERROR_MODEL = "paper"
+"""How the robot of the demonstrations errs besides its parameters, see ``read_error_model``."""
 TEST_POSE = tuple(np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0]))
 """Upper arm leaning forward, forearm level, wrist bent [rad]."""
 
@@ -136,12 +144,19 @@ def run_demo(
     problem = PlanProblem(robot, [TEST_POSE], *size, noise=settings.sigma, search=search)
     best = plan(problem, callback)
     truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)
-    truth = random_deviations(robot, truth_seed)
-    data = SimulatedCell(robot, truth, settings.sigma).measure(best.configurations, best.repetitions, noise_seed)
+    cell = demo_cell(robot, truth_seed, settings.sigma)
+    data = cell.measure(best.configurations, best.repetitions, noise_seed)
     measured = IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE])
     estimate = identify(measured)
     result = demo_report(
-        problem, best, estimate.fit, truth, seed=chance_seed, random_plans=settings.random_plans, report=folder
+        problem,
+        best,
+        estimate.fit,
+        cell,
+        predicted=estimate.positions(problem.test_pose_array),
+        seed=chance_seed,
+        random_plans=settings.random_plans,
+        report=folder,
     )
     write_plan(folder / "plan.yaml", best)
     write_measurements(folder / "measurements.csv", data)
@@ -154,6 +169,12 @@ def run_demo(
     return result
 
 
+def demo_cell(robot: Robot, seed: int, sigma: float) -> SimulatedCell:
+    """The robot of the demonstrations, its errors drawn from ``seed``, before a tracker of ``sigma`` [m]."""
+    model = read_error_model(ERROR_MODEL)
+    return SimulatedCell(robot, random_deviations(robot, seed), sigma, error_model=model, seed=seed)
+
+
 # ── truth beside estimate, before beside after, planned beside random ────────────────────────────────
 
 
@@ -161,8 +182,9 @@ def demo_report(
     problem: PlanProblem,
     plan: Plan,
     estimate: IdentifiedParameters,
-    truth: Mapping[str, float],
+    cell: SimulatedCell,
     *,
+    predicted: FloatArray | None = None,
     seed: int = 0,
     random_plans: int = RANDOM_PLANS,
     report: str | Path = "",
@@ -173,7 +195,9 @@ def demo_report(
         problem: The problem that ``plan`` solves; the random plans are measured with its noise.
         plan: What was measured.
         estimate: What was identified.
-        truth: True deviation of each parameter [m | rad].
+        cell: What was measured: the true robot before its tracker.
+        predicted: (K, targets, 3) where the estimate predicts the targets at the test poses [m]; default: where
+            its parameters put them.
         seed: Of the random plans and their noise.
         random_plans: Their number.
         report: Folder named in the result.
@@ -181,8 +205,7 @@ def demo_report(
     Raises:
         InputError: The estimate lacks parameters of the problem.
     """
-    robot, poses, sigma = problem.robot, problem.test_pose_array, problem.instrument.typical
-    cell = SimulatedCell(robot, truth, sigma)
+    robot, poses = problem.robot, problem.test_pose_array
     deviations = dict(zip(estimate.parameters, map(float, estimate.deviations), strict=True))
     std = dict(zip(estimate.parameters, map(float, estimate.std), strict=True))
     missing = [p.name for p in robot.parameters if p.name not in deviations]
@@ -191,15 +214,17 @@ def demo_report(
     random_after, random_accuracy = _random_plans(problem, cell, seed, random_plans)
     parameters = []
     for p in robot.parameters:
-        true, value = p.nominal + float(truth.get(p.name, 0.0)), p.nominal + deviations[p.name]
+        true, value = p.nominal + float(cell.deviations.get(p.name, 0.0)), p.nominal + deviations[p.name]
         parameters.append(DemoParameter(p.name, p.unit, p.nominal, true, value, std[p.name]))
+    if predicted is None:
+        predicted = robot.with_deviations(deviations).positions(poses)
     return DemoResult(
         robot=robot.name,
         configurations=len(plan.configurations),
         measurements=plan.measurements,
-        sigma=sigma,
+        sigma=problem.instrument.typical,
         before=_rms(cell.position_errors(robot, poses)),
-        after=_rms(cell.position_errors(robot.with_deviations(deviations), poses)),
+        after=_rms(_apart(cell, poses, predicted)),
         predicted_accuracy=plan.quality.predicted_accuracy,
         random_after=random_after,
         random_predicted_accuracy=random_accuracy,
@@ -225,8 +250,13 @@ def _random_plans(problem: PlanProblem, cell: SimulatedCell, seed: int, count: i
         predicted.append(np.sqrt(weights @ np.array(variances)))
         data = cell.measure(q, problem.repetitions, int(rng.integers(2**31)))
         estimate = identify(IdentificationProblem(robot, data, sigma=sigma))
-        after.append(_rms(cell.position_errors(estimate.calibrated, poses)))
+        after.append(_rms(_apart(cell, poses, estimate.positions(poses))))
     return _rms(np.array(after)), _rms(np.array(predicted))
+
+
+def _apart(cell: SimulatedCell, poses: FloatArray, predicted: FloatArray) -> FloatArray:
+    """(K, targets) distances between the true targets and ``predicted`` (K, targets, 3) at ``poses`` [m]."""
+    return np.asarray(np.linalg.norm(cell.truth.positions(poses) - predicted, axis=2))
 
 
 def _rms(values: FloatArray) -> float:

@@ -18,6 +18,8 @@ Commands = Any  # argparse's own type for what add_subparsers returns is private
 Group = argparse._ActionsContainer
 TYPICAL = "typical"
 """The word after --prior for the data sheet within usual manufacturing errors."""
+ERROR_MODEL = "typical"
+"""How a simulated robot errs, where nothing else is said: as measured robots do."""
 SIGMA = 3e-5
 """Standard deviation of one coordinate of a laser tracker, where nothing else is said [m]."""
 

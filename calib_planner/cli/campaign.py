@@ -66,6 +66,8 @@ EXAMPLE = """calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 
       --required-accuracy 15e-6 --budget 40 --simulate 1
   calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
       --required-accuracy 15e-6 --measured points.csv --next next.csv"""
+SIMULATED = "paper"
+"""How the simulated robot of a campaign errs besides its parameters, where nothing else is said."""
 DEFAULTS = {name: field.default for name, field in CampaignProblem.__dataclass_fields__.items()}
 NUMBERS = {
     "budget": "number of measurements allowed in all",
@@ -99,7 +101,10 @@ def add(commands: Commands, summary: str) -> None:
     option(play, "--simulate", "SEED", "measure a simulated robot with hidden errors", kind=int)
     text = "true standard deviation of one coordinate of its tracker [m] (as --sigma or --instrument)"
     option(play, "--simulate-sigma", "S", text, kind=float)
-    option(play, "--simulate-transmission", "S", "rms error of its joints' transmissions [rad]", 0.0)
+    text = "how it errs besides its parameters: typical, paper (not at all), or YAML, also an estimate"
+    option(play, "--simulate-error-model", "E", text, SIMULATED)
+    text = "rms error of its joints' transmissions, on top [rad]"
+    option(play, "--simulate-transmission", "S", text, 0.0)
     option(parser, "--output", "DIR", "folder for measurements, validation and estimate")
     option(parser, "--starts", "N", "number of random starts of each search", DEFAULTS["starts"])
     add_seed(parser)
@@ -196,6 +201,7 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
     sigma = args.sigma if args.simulate_sigma is None else args.simulate_sigma
     check_number("--simulate-sigma", sigma, low=0, high=1, unit="m")
     check_number("--simulate-transmission", args.simulate_transmission, low=0, high=0.1, unit="rad")
+    model = read_error_model(args.simulate_error_model)
     same = args.simulate_sigma is None and args.instrument is not None
     noise = problem.noise if same else None
     with terminal.progress("measuring") as update:
@@ -205,7 +211,7 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
             update(state.spent() / problem.budget, f"{len(state.measurements_of(FIT))} measured{accuracy}")
 
         result, world, errors = simulate_campaign(
-            problem, args.simulate, sigma, noise, args.simulate_transmission, watch
+            problem, args.simulate, sigma, noise, args.simulate_transmission, watch, model
         )
     more: dict[str, Any] = {"seed": args.seed, "simulate": args.simulate, "true": errors}
     if result.estimate is not None:

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from calib_planner.arrays import FloatArray, IntArray, check_count, check_number, plain
 from calib_planner.cli.arguments import (
+    ERROR_MODEL,
     SIGMA,
     Commands,
     add_command,
@@ -22,8 +23,9 @@ from calib_planner.cli.arguments import (
     option,
 )
 from calib_planner.cli.terminal import Terminal
+from calib_planner.error_model import to_mapping
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.io import measurements_text, read_plan, read_plan_csv, write_measurements
+from calib_planner.io import measurements_text, read_error_model, read_plan, read_plan_csv, write_measurements
 from calib_planner.robot import Robot
 from calib_planner.simulation import (
     ANGLE_ERROR,
@@ -32,7 +34,7 @@ from calib_planner.simulation import (
     independent_seeds,
     random_deviations,
 )
-from calib_planner.units import signed
+from calib_planner.units import length, signed
 
 EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7 --output measured.csv
   calib-planner identify --robot kuka_kr270 --data measured.csv"""
@@ -48,6 +50,8 @@ def add(commands: Commands, summary: str) -> None:
     truth = parser.add_argument_group("the true robot")
     text = "true deviation from nominal [m | rad]; repeat; no others then (drawn from the seed)"
     option(truth, "--true", "NAME=VALUE", text, kind=assignment, action="append")
+    text = "how it errs besides: typical (gravity, joint functions, repeatability), paper (not at all), or YAML, "
+    option(truth, "--error-model", "E", text + "also an estimate", ERROR_MODEL)
     option(truth, "--length-error", "S", "standard deviation of drawn length errors [m]", LENGTH_ERROR)
     option(truth, "--angle-error", "S", "standard deviation of drawn angle errors [rad]", ANGLE_ERROR)
     option(truth, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", SIGMA)
@@ -70,7 +74,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     check_count("--seed", args.seed, low=0, high=2**63 - 1)
     truth_seed, noise_seed = independent_seeds(args.seed, 2)
     errors = _true_errors(robot, args, truth_seed)
-    cell = SimulatedCell(robot, errors, args.sigma)
+    model = read_error_model(args.error_model)
+    cell = SimulatedCell(robot, errors, args.sigma, error_model=model, seed=truth_seed)
     data = cell.measure(configurations, repetitions, noise_seed)
     result = {
         "robot": robot.name,
@@ -78,6 +83,10 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             {"name": p.name, "unit": p.unit, "nominal": p.nominal, "deviation": errors[p.name]}
             for p in robot.with_parameters(tuple(errors)).parameters
         ],
+        "error_model": {
+            "terms": [{"name": name, "size": size} for name, size in cell.truth.sizes(data.q).items()],
+            "model": to_mapping(cell.truth.model),
+        },
         "joint_names": robot.joint_names,
         "configurations": data.q,
         "points": data.p,
@@ -130,5 +139,10 @@ def _show(result: dict[str, Any], console: Console) -> None:
         unit = "mm" if row["unit"] == "m" else "mrad"
         table.add_row(row["name"], unit, signed(1e3 * row["deviation"], 4, plus=True))
     console.print(table)
+    terms = Table("term", title=f"error model {result['error_model']['model']['name']}: what moves the points")
+    terms.add_column("rms", justify="right")
+    for row in result["error_model"]["terms"]:
+        terms.add_row(row["name"], length(row["size"]))
+    console.print(terms)
     where = f" written to {result['output']}" if result["output"] else ""
     console.print(f"{result['measurements']} measurements{where}, seed {result['seed']}")

@@ -33,14 +33,22 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
 
-from calib_planner.demo import ROBOT, TEST_POSE, DemoResult, demo_report, draw, print_table
+from calib_planner.demo import (
+    ERROR_MODEL,
+    ROBOT,
+    TEST_POSE,
+    DemoResult,
+    demo_cell,
+    demo_report,
+    draw,
+    print_table,
+)
 from calib_planner.errors import CalibPlannerError, InfeasibleError
 from calib_planner.planning import PlanProblem
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import estimate_from_message, plan_from_message
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
-from calib_planner.simulation import random_deviations
 from calib_planner.units import length
 
 ATTEMPT = 8.0
@@ -243,7 +251,7 @@ def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> De
         nodes.start("planner_node", {"robot": ROBOT})
         save = {"save_folder": f"'{folder.resolve()}'", "samples": SAMPLES, "sigma": SIGMA}
         nodes.start("identifier_node", {"robot": ROBOT} | save)
-        nodes.start("simulator_node", {"robot": ROBOT, "seed": seed, "sigma": SIGMA})
+        nodes.start("simulator_node", {"robot": ROBOT, "seed": seed, "sigma": SIGMA, "error_model": ERROR_MODEL})
         client = DemoClient(domain, nodes.check)
         try:
             plan = _measure(configurations, seed, client, screen)
@@ -256,8 +264,8 @@ def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> De
     robot = Robot.load(ROBOT).with_parameters(LEVEL)
     received = plan_from_message(plan).plan
     problem = PlanProblem(robot, [TEST_POSE], configurations, noise=received.sigma)
-    truth = random_deviations(robot, seed)
-    result = demo_report(problem, received, estimate, truth, seed=seed, report=folder)
+    cell = demo_cell(robot, seed, received.sigma)
+    result = demo_report(problem, received, estimate, cell, seed=seed, report=folder)
     draw(result, folder / "demo.png")
     (folder / "demo.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n")
     return result

@@ -21,7 +21,7 @@ from calib_planner.io import config_folder
 from calib_planner.planning import CRITERIA
 from calib_planner.ros.lifecycle import LifecycleParameters
 from calib_planner.ros.parameters import at_configure, constraints_text, described, parameter
-from calib_planner.simulation import Faults
+from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, Faults
 from calib_planner.units import cut
 
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas between"
@@ -137,8 +137,17 @@ class SimulatorParameters(LifecycleParameters, Faults):
     robot: str = at_configure("kuka_kr270", "name of a shipped robot")
     parameters: str = at_configure("lengths+offsets", "which parameters have true errors: a level or names")
     seed: int = at_configure(0, "seed of everything that is drawn", "", 0, LARGEST_SEED)
-    length_error: float = at_configure(1e-3, "standard deviation of the true errors of lengths", "m", 0.0, 1.0)
-    angle_error: float = at_configure(1e-3, "standard deviation of the true errors of angles", "rad", 0.0, 1.0)
+    error_model: str = at_configure(
+        "typical",
+        "how the robot errs besides its parameters: typical (gravity, joint functions, repeatability), "
+        "paper (not at all), or the path of a YAML file, also of an estimate",
+    )
+    length_error: float = at_configure(
+        LENGTH_ERROR, "standard deviation of the true errors of lengths", "m", 0.0, 1.0
+    )
+    angle_error: float = at_configure(
+        ANGLE_ERROR, "standard deviation of the true errors of angles", "rad", 0.0, 1.0
+    )
     true_deviations: str = at_configure("", "true errors instead of random ones, as d1=0.0005,q2=-0.001 [m, rad]")
     sigma: float = at_configure(3e-5, "noise of one coordinate of a tracker point", "m", 0.0, 1.0)
     instrument: str = at_configure(

@@ -47,7 +47,7 @@ def test_plan_simulate_identify(call: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_plan(plan_file).configurations, found["configurations"])
 
     arguments = ("--robot", "kuka_kr270", "--seed", "3", "--json")
-    made = call("simulate", *arguments, "--plan", plan_file, "--output", data)
+    made = call("simulate", *arguments, "--plan", plan_file, "--error-model", "paper", "--output", data)
     assert made["measurements"] == 12
     result = call(
         "identify", *arguments, "--data", data, "--sigma", "3e-5", "--output", estimate_file,
@@ -73,7 +73,8 @@ def test_csv_plan_and_csv_on_stdout(call: Any, tmp_path: Path) -> None:
     assert len(found["predicted_accuracy_per_test_pose"]) == 2
     per, w = np.array(found["predicted_accuracy_per_test_pose"]), np.array([1, 2]) / 3
     assert found["predicted_accuracy"] == pytest.approx(np.sqrt(w @ per**2))
-    lines = call("simulate", "--robot", "planar_2r", "--plan", path, "--true", "l1=0.001", "--sigma", "0")
+    words = ("--true", "l1=0.001", "--sigma", "0", "--error-model", "paper")
+    lines = call("simulate", "--robot", "planar_2r", "--plan", path, *words)
     header, *rows = lines.splitlines()
     assert header == "q1,q2,x1,y1,z1" and len(rows) == 3
     q, p = np.split(np.array([[float(v) for v in row.split(",")] for row in rows]), [2], axis=1)

@@ -126,16 +126,19 @@ POSE = '--degrees --test-pose "0 -60 90 0 45 0"'
 RADIANS = '--test-pose "0 -1.05 1.57 0 0.79 0"'
 ARM_POSE = '--test-pose "0.2 0.3 -0.4 0.1 0.5 0"'
 ARM_TARGETS = '--targets "0.05 0.02 0.04" --targets "0.03 -0.05 0"'
+ARM = f"--robot arm.urdf {ARM_TARGETS} --parameters full"
+EXACT = "--error-model paper --length-error 1e-3"
+"""A robot that errs by its parameters alone, in its lengths by 1 mm."""
 
 MADE: Mapping[str, str] = {
     "kuka_plan.yaml": f"plan --robot kuka_kr270 {POSE} --configurations 4 --repetitions 2 --starts 4",
     "arm_plan.yaml": f"plan --robot arm.urdf --parameters offsets {ARM_POSE} --configurations 4 --starts 2",
-    "planar_points.csv": "simulate --robot planar_2r --plan planar.csv --seed 1",
-    "kuka_points.csv": "simulate --robot kuka_kr270 --plan kuka.csv --seed 2",
-    "kuka_new.csv": "simulate --robot kuka_kr270 --plan kuka_few.csv --seed 2",
-    "kuka_again.csv": "simulate --robot kuka_kr270 --plan kuka.csv --repetitions 2 --seed 3",
-    "arm_points.csv": f"simulate --robot arm.urdf {ARM_TARGETS} --parameters full --plan arm.csv --seed 4",
-    "arm_held_out.csv": f"simulate --robot arm.urdf {ARM_TARGETS} --parameters full --plan arm_new.csv --seed 4",
+    "planar_points.csv": f"simulate --robot planar_2r --plan planar.csv --seed 1 {EXACT}",
+    "kuka_points.csv": f"simulate --robot kuka_kr270 --plan kuka.csv --seed 2 {EXACT}",
+    "kuka_new.csv": f"simulate --robot kuka_kr270 --plan kuka_few.csv --seed 2 {EXACT}",
+    "kuka_again.csv": f"simulate --robot kuka_kr270 --plan kuka.csv --repetitions 2 --seed 3 {EXACT}",
+    "arm_points.csv": f"simulate {ARM} --plan arm.csv --seed 4 {EXACT}",
+    "arm_held_out.csv": f"simulate {ARM} --plan arm_new.csv --seed 4 {EXACT}",
     "kuka_estimate.yaml": "identify --robot kuka_kr270 --data kuka_points.csv",
     "arm_estimate.yaml": "identify --robot arm.urdf --parameters full --unknown base,tool --prior typical "
     "--data arm_points.csv",
@@ -325,10 +328,11 @@ def _others() -> list[Case]:
         ),
         Case("simulate", "simulate --robot kuka_kr270 --plan kuka_plan.yaml --seed 7 --output m.csv", ("m.csv",)),
         Case("simulate_repeated", "simulate --robot kuka_kr270 --plan kuka_few.csv --repetitions 2 --seed 8"),
+        Case("simulate_paper", "simulate --robot kuka_kr270 --plan kuka_few.csv --error-model paper --seed 8"),
         Case(
             "simulate_true",
             "simulate --robot planar_2r --plan planar_deg.csv --degrees --true l1=1e-3 --true dq2=-2e-3 "
-            "--sigma 0",
+            "--sigma 0 --error-model paper",
         ),
         Case(
             "simulate_urdf",
@@ -339,6 +343,9 @@ def _others() -> list[Case]:
             "campaign_simulated",
             f"{campaign} --simulate 1 --budget 20 --output c",
             ("c/measurements.csv", "c/validation.csv", "c/estimate.yaml"),
+        ),
+        Case(
+            "campaign_typical", f"{campaign} --simulate 1 --simulate-error-model typical --budget 12 --minimum 5"
         ),
         Case(
             "campaign_transmission",

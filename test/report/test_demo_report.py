@@ -22,12 +22,12 @@ def result() -> DemoResult:
     robot = Robot.load("planar_2r").with_parameters("lengths+offsets")
     problem = PlanProblem(robot, [0.3, 0.5], 4, search=Search(starts=4))
     made = plan(problem)
-    truth = random_deviations(robot, 2)
-    data = SimulatedCell(robot, truth, problem.instrument.typical).measure(made.configurations, 1, 2)
+    cell = SimulatedCell(robot, random_deviations(robot, 2), problem.instrument.typical)
+    data = cell.measure(made.configurations, 1, 2)
     estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
     with pytest.raises(InputError, match="estimate"):
-        demo_report(PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6), made, estimate.fit, truth)
-    return demo_report(problem, made, estimate.fit, truth, report="here")
+        demo_report(PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6), made, estimate.fit, cell)
+    return demo_report(problem, made, estimate.fit, cell, report="here")
 
 
 def test_numbers(result: DemoResult) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,15 @@ from sensor_msgs.msg import JointState
 
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import NANO
+from calib_planner.error_model import typical
+from calib_planner.io import write_error_model
 from calib_planner.planning import Search
 from calib_planner.ros.messages import nanoseconds, plan_to_message
 from calib_planner.ros.nodes import simulator as simulator_node
 from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import STREAM_IN
-from calib_planner.simulation import Tour, make_tour
+from calib_planner.simulation import Tour, make_tour, random_deviations
+from calib_planner.tracker import Isotropic
 
 ACTION = "tracker_simulator/execute_plan"
 Result = ExecutePlan.Result
@@ -45,7 +49,8 @@ def goal_of(planned: Plan, **changes: Any) -> ExecutePlan.Goal:
 def test_it_visits_every_configuration(bench: Bench, planned: Plan) -> None:
     states = bench.hear(JointState, "joint_states", STREAM_IN)
     points = bench.hear(PointStamped, "tracker/point", STREAM_IN)
-    bench.start(SimulatorNode, robot="planar_2r", true_deviations="l1=0.002", joint_speed=50.0, sigma=1e-5)
+    exact = {"error_model": "paper", "sigma": 1e-5}
+    bench.start(SimulatorNode, robot="planar_2r", true_deviations="l1=0.002", joint_speed=50.0, **exact)
     bench.wait(lambda: states and points)
     feedback: list[Any] = []
     client = bench.action(ExecutePlan, ACTION)
@@ -181,6 +186,21 @@ def test_an_instrument(bench: Bench) -> None:
     assert 1e-6 < xyz.std(axis=0).max() < 1e-4
 
 
+@pytest.mark.parametrize("source", ["typical", "paper", "file"])
+def test_an_error_model(bench: Bench, tmp_path: Path, source: str) -> None:
+    write_error_model(tmp_path / "m.yaml", typical().without("gravity"))
+    words = {"typical": {}, "paper": {"error_model": "paper"}, "file": {"error_model": str(tmp_path / "m.yaml")}}
+    node = bench.start(SimulatorNode, robot="ur10e", parameters="full", seed=5, **words[source])
+    terms = {"typical": 5, "paper": 2, "file": 4}[source]
+    truth = node.world.truth
+    assert len(truth.model.terms) == terms and truth.model.points.noise == Isotropic(3e-5)
+    # The same placement, whatever else is wrong.
+    wanted = random_deviations(node.world.robot, 5)
+    assert dict(zip(truth.robot.parameter_names, truth.coefficients.tolist(), strict=False)) == wanted
+    at_rest = node.world.robot.joint_limits.mean(axis=1)[None]
+    assert np.array_equal(truth.actual(at_rest), at_rest) == (source == "paper")
+
+
 def test_the_truth_is_nowhere_on_the_graph(bench: Bench) -> None:
     bench.start(SimulatorNode, robot="planar_2r")
     mine = {
@@ -226,6 +246,7 @@ def test_new_faults_from_a_new_configure(bench: Bench) -> None:
         ({"true_deviations": "d1=nan"}, "true_deviations"),
         ({"true_deviations": "d1"}, "true_deviations"),
         ({"tracker_topics": ["a", "b"]}, "tracker_topics"),
+        ({"error_model": "typcal"}, "typcal"),
     ],
 )
 def test_what_cannot_be_is_said(bench: Bench, values: dict[str, Any], words: str) -> None:

@@ -28,7 +28,8 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 16})
         nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
-        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7})
+        exact = {"error_model": "paper"}  # nothing but parameters and noise, which the estimate is held to
+        nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7} | exact)
         client = DemoClient(domain, nodes.check)
         try:
             request = PlanCalibration.Request(

@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 
 from calib_planner.arrays import check_number
 from calib_planner.errors import CalibPlannerError, InputError
-from calib_planner.io import config_folder, read_instrument
+from calib_planner.io import config_folder, read_error_model, read_instrument
 from calib_planner.ros.executor import check_executable
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.messages import joints_message, plan_from_message, point_message
@@ -176,6 +176,7 @@ def make_world(chosen: SimulatorParameters) -> World:
 
     Raises:
         InputError: A robot, parameter or true deviation that does not exist.
+        FileFormatError: The file of the error model is not readable.
     """
     robot = load_shipped(chosen.robot, chosen.parameters)
     given = chosen.deviations(robot.available_parameters)
@@ -183,7 +184,9 @@ def make_world(chosen: SimulatorParameters) -> World:
     instrument = None
     if chosen.instrument != "sigma":
         instrument = read_instrument(config_folder() / "instruments" / f"{chosen.instrument}.yaml")
-    return World(SimulatedCell(robot, errors, chosen.sigma, instrument), chosen, chosen.seed)
+    model = read_error_model(chosen.error_model)
+    cell = SimulatedCell(robot, errors, chosen.sigma, instrument, model, chosen.seed)
+    return World(cell, chosen, chosen.seed)
 
 
 def main(args: Sequence[str] | None = None) -> int:
