@@ -28,6 +28,7 @@ from calib_planner.identification.estimation import (
     placement_alone,
 )
 from calib_planner.identification.problem import LOSSES, IdentificationProblem
+from calib_planner.identification.registration import Misplacement, find_misplacement
 from calib_planner.identification.solver import check_units, identify, place_nominal, start_robot
 from calib_planner.identification.term_gain import TermGain
 from calib_planner.identification.validation import normalised, validate

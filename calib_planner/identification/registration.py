@@ -176,3 +176,53 @@ def tip_poses(robot: Robot, q: FloatArray, *, at_base: bool) -> tuple[FloatArray
     frame = np.vstack([np.zeros(3), np.eye(3)])
     points = replace(robot, parameter_names=()).with_targets(frame).positions(q)
     return (points[:, 1:] - points[:, :1]).transpose(0, 2, 1), points[:, 0]
+
+
+MISPLACED = 0.02
+"""Points farther than this are of a robot that stands elsewhere: nominal arms err by a few millimetres [m]."""
+NO_BETTER = 2.0
+"""Of two explanations the simpler one is taken unless the other is this many times closer."""
+
+
+@dataclass(frozen=True)
+class Misplacement:
+    """What has to be unknown for the points to fit the nominal robot.
+
+    Attributes:
+        unknown: ``base``, ``tool``, both, or nothing.
+        before: Median distance of the points from the robot as it was given [m].
+        after: The same with ``unknown`` fitted [m].
+    """
+
+    unknown: tuple[str, ...]
+    before: float
+    after: float
+
+
+def find_misplacement(robot: Robot, data: Measurements) -> Misplacement:
+    """Whether base or targets stand elsewhere than the robot says: the simplest explanation that fits.
+
+    Args:
+        robot: With base and targets as they were given.
+        data: The measurements.
+    """
+    seen = data.seen
+    before = _median(robot, data)
+    best = Misplacement((), before, before)
+    if not before > MISPLACED or 3 * int(seen.sum()) <= 6 + 3 * seen.shape[1]:
+        return best
+    for unknown in (("tool",), ("base",), ("base", "tool")):
+        try:
+            base, tool = "base" in unknown, "tool" in unknown
+            after = _median(register(robot, data, base=base, tool=tool, robust=True), data)
+        except NotEnoughDataError:
+            continue
+        if after * NO_BETTER < best.after:
+            best = Misplacement(unknown, before, after)
+    return best
+
+
+def _median(robot: Robot, data: Measurements) -> float:
+    """Median distance of the points from where ``robot`` has them [m]."""
+    points = replace(robot, parameter_names=()).positions(data.q)
+    return float(np.median(np.linalg.norm(data.p - points, axis=2)[data.seen]))
