@@ -237,7 +237,7 @@ def _achieved(estimate: Estimate, required: float, data: Measurements) -> Reason
     square = float(np.mean(np.sum(residuals**2, axis=1)))
     noise = 3.0 * estimate.noise.sigma**2
     return RULES["achieved_at_test_poses"].reason(
-        "PASS" if without_noise(square, noise, len(residuals)) <= required else "FAIL",
+        "PASS" if without_noise(square, noise, 3.0 * len(residuals)) <= required else "FAIL",
         points=counted(len(residuals), "point"),
         achieved=length(float(np.sqrt(square))),
         noise=length(float(np.sqrt(noise))),

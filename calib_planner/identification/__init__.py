@@ -19,6 +19,7 @@ from calib_planner.identification.estimate import (
     Residuals,
     Validation,
     Verdict,
+    chance_of,
     without_noise,
 )
 from calib_planner.identification.estimation import (

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
 from calib_planner.error_model import Knowledge, to_mapping
@@ -37,6 +37,8 @@ LEVELS = ("PASS", "WARN", "FAIL")
 """Levels of a verdict and of its reasons, the best first."""
 STRONG = 0.95
 """Correlations beyond this are named."""
+CHANCE = 0.01
+"""What happens by chance less often than this is taken for no chance."""
 
 
 def _freeze(value: object, *names: str) -> None:
@@ -256,6 +258,7 @@ class Validation:
         within_95: Share of the points inside their 95 % region.
         placement_mean, placement_rms: With placement alone, as a URDF holds it.
         noise_rms: What the measurement of these points alone adds to rms; NaN where nobody states it.
+        freedom: Degrees of freedom of rms², as a χ², see ``chance_of``.
     """
 
     count: int
@@ -269,27 +272,40 @@ class Validation:
     placement_mean: float
     placement_rms: float
     noise_rms: float
+    freedom: float
 
     @property
     def robot_rms(self) -> float:
-        """Lower limit of the robot's own error [m], see ``without_noise``; all of rms where the measurement's
-        part is not known.
-        """
-        if not np.isfinite(self.noise_rms):
-            return self.rms
-        return without_noise(self.rms**2, self.noise_rms**2, self.count)
+        """The robot's own part of rms [m], see ``without_noise``; all of it where the noise is not stated."""
+        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2)
+
+    @property
+    def robot_least(self) -> float:
+        """What the robot's own part is at least, if chance made rms large [m]."""
+        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2, self.freedom)
 
 
-def without_noise(square: float, noise: float, count: int) -> float:
-    """The robot's part of measured distances [m]: the measurement's part and two standard deviations of that
-    are taken off, e² = mean ‖r‖² − 3σ² (1 + 2 √(2/(3n))).
+def without_noise(square: float, noise: float, freedom: float = np.inf) -> float:
+    """The robot's part of measured distances [m]: e² = mean ‖r‖² − 3σ².
 
     Args:
         square: Mean square distance of the points, mean ‖r‖² [m²].
         noise: What the measurement alone adds to it, 3σ² [m²].
-        count: Number of points, n.
+        freedom: Degrees of freedom of the mean square, three a point where points err independently. With them
+            the result is a lower limit: what chance may have added is taken off first, see ``chance_of``.
     """
-    return float(np.sqrt(max(square - noise * (1.0 + 2.0 * np.sqrt(2.0 / (3.0 * count))), 0.0)))
+    return float(np.sqrt(max(square / chance_of(freedom) ** 2 - noise, 0.0)))
+
+
+def chance_of(freedom: float) -> float:
+    """Factor by which a root mean square exceeds its expectation by chance once in a hundred (``CHANCE``).
+
+    Args:
+        freedom: Degrees of freedom of the mean square, as a χ²; infinite: it is what is expected.
+    """
+    if not np.isfinite(freedom):
+        return 1.0
+    return float(np.sqrt(chdtri(freedom, CHANCE) / freedom)) if freedom > 0.0 else float("inf")
 
 
 @dataclass(frozen=True)
@@ -301,6 +317,7 @@ class LeftOutError:
         mean, rms, max: Distances; NaN where no visit can be predicted from the others.
         predicted_rms: What rms should be by the error model.
         noise_rms: What the measurement of these points alone adds to rms; NaN where nobody states it.
+        freedom: Degrees of freedom of rms², as a χ², see ``chance_of``; 0 without points.
     """
 
     count: int
@@ -308,14 +325,18 @@ class LeftOutError:
     rms: float
     max: float
     predicted_rms: float
-    noise_rms: float = float("nan")
+    noise_rms: float
+    freedom: float
 
     @property
     def robot_rms(self) -> float:
         """As ``Validation.robot_rms`` [m]."""
-        if not np.isfinite(self.noise_rms):
-            return self.rms
-        return without_noise(self.rms**2, self.noise_rms**2, self.count)
+        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2)
+
+    @property
+    def robot_least(self) -> float:
+        """As ``Validation.robot_least`` [m]."""
+        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2, self.freedom)
 
 
 @dataclass(frozen=True)

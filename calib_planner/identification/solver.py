@@ -69,7 +69,9 @@ def identify(problem: IdentificationProblem) -> Estimate:
     hidden = _hidden(problem.model, robot, robot.jacobian(problem.data.q)[rows])
     fit = _fit(problem, problem.model, robot, hidden)
     if fit.knowledge.hidden.shape[1]:
-        hidden = _hidden(problem.model, robot, fit.knowledge.poses(problem.data.q).jacobian[rows])
+        hidden = _hidden(
+            problem.model, robot, fit.knowledge.poses(problem.data.q, problem.data.payload).jacobian[rows]
+        )
         fit = _fit(problem, problem.model, robot, hidden)
     check_count(problem, problem.data.seen & (fit.doubt == 0.0))
     alone = fit
@@ -248,7 +250,7 @@ def _estimate(
     std = np.sqrt(np.diag(covariance))
     std[list(hidden.fixed)] = np.nan
     status = "not_converged" if not fit.converged else "rank_deficient" if hidden.fixed else "ok"
-    predicted = known.poses(data.q).points
+    predicted = known.poses(data.q, data.payload).points
     residuals = data.p - predicted
     normalised = np.where(seen, np.sqrt(squares_of_points(fit.solution, fit.doubt)[0]), np.nan)
     gate = float(np.sqrt(gate_of(int(seen.sum()))))
@@ -330,7 +332,25 @@ def _left_out_error(left: LeftOut, fit: ModelEstimate, source: str) -> LeftOutEr
     noise = float("nan")
     if part is not None and source != "residuals" and left.usable.any():
         noise = float(np.sqrt(np.mean(_variances(part, left.usable))))
-    return LeftOutError(int(left.usable.sum()), told.mean, told.rms, told.max, left.predicted_rms, noise)
+    count, freedom = int(left.usable.sum()), _freedom_left_out(left, fit)
+    return LeftOutError(count, told.mean, told.rms, told.max, left.predicted_rms, noise, freedom)
+
+
+def _freedom_left_out(left: LeftOut, fit: ModelEstimate) -> float:
+    """Degrees of freedom of the mean square left-out distance, as a χ².
+
+    Σ‖e_i‖² has the expectation Σ tr S_i and, if the visits were independent, the variance 2 Σ tr S_i², S_i being
+    the covariance of e_i. They are not: m coordinates with p flat parameters have m − p independent residuals,
+    and so many times fewer degrees of freedom there are.
+    """
+    use = np.repeat(left.usable, 3, axis=1)
+    blocks = left.covariance * (use[:, :, None] & use[:, None, :])
+    if not use.any():
+        return 0.0
+    independent = np.trace(blocks, axis1=1, axis2=2).sum() ** 2 / np.sum(blocks**2)
+    linear = fit.solution.problem
+    coordinates = float(linear.seen.sum())
+    return float(independent * max(coordinates - linear.basis.shape[1], 0.0) / coordinates)
 
 
 def _variances(part: FloatArray, use: BoolArray) -> FloatArray:

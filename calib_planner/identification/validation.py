@@ -3,6 +3,10 @@
 At a held-out point measured − predicted should scatter like the covariance that ``Knowledge.predict`` gives. If
 it is right, 95 % of the points lie inside their 95 % region (χ²₃).
 
+Chance moves the mean square distance, the more so as errors of the parameters are common to all points: with the
+covariance S of all residuals together it has the mean tr S/n and the variance 2 tr S²/n², that is, those of a χ²
+with (tr S)²/tr S² degrees of freedom.
+
 A *re-seated target* is a new one, of which nothing is known but what the rows of the seat tell
 (``Knowledge.with_new_targets``, ``updated``). The test rows are not changed.
 """
@@ -16,6 +20,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from calib_planner.arrays import FloatArray, one_thread
+from calib_planner.error_model import Knowledge
 from calib_planner.errors import InputError, NotEnoughDataError
 from calib_planner.identification.estimate import Estimate, Validation
 from calib_planner.identification.problem import IdentificationProblem
@@ -78,6 +83,7 @@ class _Prediction:
         covariance: (points, 3, 3) what these should scatter like [m²].
         measured: (points, 3) variances of the measurement alone [m²]; NaN where nobody states them.
         alone, nominal: (points,) distances from placement alone, and from the nominal kinematics [m].
+        spread: tr S² of the covariance S of all residuals together [m⁴].
     """
 
     residuals: FloatArray
@@ -85,6 +91,7 @@ class _Prediction:
     measured: FloatArray
     alone: FloatArray
     nominal: FloatArray
+    spread: float
 
 
 def _predict(
@@ -97,14 +104,33 @@ def _predict(
         there = estimate.calibrated.target_offsets[:targets]
         offsets[: len(there)] = there
         known = known.with_new_targets(offsets)
-        known = known.updated(seat.q, np.where(seat.seen[:, :, None], seat.p, 0.0), seat.seen)
-    told = known.predict(rest.q)
+        known = known.updated(
+            seat.q, np.where(seat.seen[:, :, None], seat.p, 0.0), seat.seen, payload=seat.payload
+        )
+    told = known.predict(rest.q, rest.payload)
     measured = np.diagonal(told.noise, axis1=2, axis2=3)[:, :targets]
     if estimate.noise.source == "residuals":  # the robot's own scatter may be part of it
         measured = np.full_like(measured, np.nan)
     seen = rest.seen
     residuals = (rest.p - told.mean[:, :targets])[seen]
-    return _Prediction(residuals, told.total[:, :targets][seen], measured[seen], alone, nominal)
+    spread = _squared_trace(known, rest)
+    return _Prediction(residuals, told.total[:, :targets][seen], measured[seen], alone, nominal, spread)
+
+
+def _squared_trace(known: Knowledge, rest: Measurements) -> float:
+    """tr S² [m⁴] of S = J⁺ C J⁺ᵀ + blockdiag(R_i) of all points of ``rest``: what the parameters have of their
+    errors they share.
+    """
+    poses, seen = known.poses(rest.q, rest.payload), rest.seen
+    there = np.zeros((len(poses), len(known.robot.targets)))
+    there[:, : seen.shape[1]] = seen
+    use = np.repeat(there, 3, axis=1)
+    values, vectors = np.linalg.eigh(known.covariance)
+    half = (known.model.columns(poses) * use[:, :, None]) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    own = known.model.visit_covariance(poses) * use[:, :, None] * use[:, None, :]
+    flat = half.reshape(-1, half.shape[2])
+    shared, cross = np.sum((flat.T @ flat) ** 2), np.sum(half * (own @ half))
+    return float(shared + 2.0 * cross + np.sum(own**2))
 
 
 def _distances(robot: Robot, seat: Measurements, rest: Measurements) -> FloatArray:
@@ -136,6 +162,7 @@ def _statistics(parts: list[_Prediction]) -> Validation:
         placement_mean=float(alone.mean()),
         placement_rms=float(np.sqrt(np.mean(alone**2))),
         noise_rms=float(np.sqrt(np.mean(np.sum(noise, axis=1)))),
+        freedom=float(np.einsum("kii->", covariance) ** 2 / sum(p.spread for p in parts)),
     )
 
 

@@ -4,7 +4,16 @@ Every reason has a level of its own; the verdict is the worst of them. A reason 
 needs no action. The verdict follows from the numbers of the estimate alone.
 
 ``RULES`` is the table of everything that ``judge`` can say: code, text, and what to do at each level that the
-reason can have.
+reason can have. Its order is the order of importance: of two reasons of one level the earlier one comes first.
+
+*Achieved and predicted.* Visits left out and held-out points say what is achieved. A ratio of what is achieved
+to what was predicted counts as far as chance does not explain it: it is divided by the factor that chance makes
+of it once in a hundred (``chance_of``), so that few points accuse nobody.
+
+*The requirement* is judged at the test poses where there are any: by what is predicted there, times the ratio of
+achieved to predicted at the visits left out where that counts. Without test poses the visits left out are judged
+themselves, and held-out points always are. Of what is measured the instrument's own part is taken off. FAIL needs
+that chance is excluded; in between is WARN.
 """
 
 from __future__ import annotations
@@ -14,13 +23,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_planner.identification.estimate import Estimate, Reason, Validation, Verdict
+from calib_planner.identification.estimate import Estimate, LeftOutError, Reason, Validation, Verdict, chance_of
 from calib_planner.units import counted, length, listed
 
 LARGEST_RESIDUAL = 5e-3
 """No industrial robot is left with more than this after a calibration that was set up rightly [m]."""
 LARGE_RESIDUAL = 1e-3
-"""Measured robots are left with 0.1 to 0.45 mm: twice the largest of these explains little [m]."""
+"""Measured robots are left with 0.1 to 0.45 mm: less than twice the largest of these is not looked into [m]."""
+LITTLE = 0.5
+"""Share of the error before that is left after a fit that explains little."""
 MANY, INSIDE = 30, 0.8
 """Of at least this many held-out points, at least this share must lie in their 95 % region."""
 APART = 1.5
@@ -58,7 +69,8 @@ def _each(advice: str, *levels: str) -> dict[str, str]:
 
 
 _TOGETHER = {"PASS": "do not read their values one by one; predictions are safe"}
-_PREDICTED = "predicted at the test poses: {worst} where {required} are required"
+_MORE = "measure more configurations: calib-planner plan --measured … --accuracy …"
+_CLOSER = "free more parameters, measure more, or calibrate closer to the task"
 
 _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
     ("not_converged", "the iteration did not converge", {"FAIL": "{message}"}),
@@ -68,24 +80,83 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
         {"FAIL": "check joint order, signs, units, and which point is whose"},
     ),
     (
+        "blind_test_pose",
+        "the error at {count} of {poses} test poses depends on what the data cannot see",
+        {"FAIL": "measure configurations that move those parameters"},
+    ),
+    (
+        "required_accuracy: held out",
+        "{points}: {achieved} achieved, {noise}, where {required} are required",
+        {"PASS": ""} | _each(_CLOSER, "WARN", "FAIL"),
+    ),
+    (
+        "required_accuracy",
+        "expected at the worst test pose: {worst} where {required} are required",
+        {"PASS": ""} | _each(_MORE, "WARN", "FAIL"),
+    ),
+    (
+        "required_accuracy: left out",
+        "visits left out in turn: {achieved} achieved, {noise}, where {required} are required",
+        {"PASS": ""} | _each(_CLOSER, "WARN", "FAIL"),
+    ),
+    (
+        "no_gain_held_out",
+        "{points} are no better than before: {after}, before {before}",
+        {"FAIL": "do not apply it: free fewer parameters or measure more"},
+    ),
+    (
+        "no_gain_left_out",
+        "visits left out in turn are no better than before: {after}, before {before}",
+        {"FAIL": "do not apply it: free fewer parameters or measure more"},
+    ),
+    (
+        "predicted_and_achieved",
+        "{points}: {achieved} achieved where {predicted} were predicted",
+        {"PASS": ""} | _each("they lie elsewhere than the measured points, or the robot changed", "WARN", "FAIL"),
+    ),
+    (
+        "left_out",
+        "visits left out in turn: {achieved} achieved where {predicted} were predicted",
+        {"PASS": ""}
+        | _each("the visits contradict the error model: look at the rejected points first", "WARN", "FAIL"),
+    ),
+    (
+        "moved",
+        "every point from row {row} on was rejected: something moved for good",
+        {"WARN": "the fit is to the rows before; measure those after again"},
+    ),
+    (
+        "rejected",
+        "{rejected} of {points} rejected",
+        _each("each is listed with its reason; measure those configurations again", "PASS", "WARN", "FAIL"),
+    ),
+    (
+        "unproven",
+        "no visit can be predicted from the others: there is no left-out error",
+        {"WARN": "measure more configurations than the parameters need"},
+    ),
+    (
+        "too_few_measurements",
+        "so few measurements that the left-out error may by chance be {factor} times what is predicted",
+        {"WARN": "measure more configurations than the parameters need, or ask for fewer parameters"},
+    ),
+    (
         "explained_little",
         "{after} are left of {before}: the fit explains little",
         {"WARN": "free more parameters (--parameters full), and check joint order, signs and zeros"},
     ),
     (
         "no_gain",
-        "the fit improved the points from {before} to {after} only",
-        {"WARN": "the robot's errors lie in other parameters: free those"},
+        "the fit changed the mean error of the points from {before} to {after} only",
+        {
+            "PASS": "the measurement's noise explains both: there is nothing to correct",
+            "WARN": "the robot's errors lie in other parameters: free those",
+        },
     ),
     (
         "copies",
         "{rows} repeated digit for digit",
         {"WARN": "a measurement given twice counts twice: leave the copies out"},
-    ),
-    (
-        "rejected",
-        "{rejected} of {points} rejected",
-        _each("each is listed with its reason; measure those configurations again", "PASS", "WARN", "FAIL"),
     ),
     (
         "suspects",
@@ -98,14 +169,24 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
         {"WARN": "free more parameters, look for gross errors, check sigma"},
     ),
     (
+        "region",
+        "{points}: only {share} % lie in the regions where 95 % were expected",
+        {"WARN": "compare the two sets: temperature, the tracker's place, the target's seat, load"},
+    ),
+    (
         "noise_overstated",
         "the residuals scatter {scatter}, far less than the {noise} stated",
         {"WARN": "the standard deviations are too large: check sigma"},
     ),
     (
-        "moved",
-        "every point from row {row} on was rejected: something moved for good",
-        {"WARN": "the fit is to the rows before; measure those after again"},
+        "error_model",
+        "the robot errs beyond its geometry ({terms} at the measured points): this is part of every prediction, "
+        "but a URDF holds placement alone, with which visits left out in turn err by {alone} and not {complete}",
+        {
+            "PASS": "where that is too much, correct the joint targets: calib-planner compensate",
+            "WARN": "a URDF alone does not reach what is required: correct the joint targets (calib-planner "
+            "compensate)",
+        },
     ),
     (
         "unidentifiable",
@@ -114,69 +195,14 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
     ),
     ("nearly_dependent", "{combinations} hardly seen by these data: {weakest}", _TOGETHER),
     ("correlated", "strongly correlated: {pairs}, most of all {one} and {other} ({correlation})", _TOGETHER),
-    (
-        "blind_test_pose",
-        "the error at {count} of {poses} test poses depends on what the data cannot see",
-        {"FAIL": "measure configurations that move those parameters"},
-    ),
-    (
-        "required_accuracy",
-        _PREDICTED,
-        {"PASS": "", "FAIL": "measure more configurations: calib-planner plan --measured … --accuracy …"},
-    ),
-    (
-        "required_accuracy: held out",
-        "{points}: {achieved} achieved, {noise}, where {required} are required",
-        {"PASS": "", "FAIL": "free more parameters, measure more, or calibrate closer to the task"},
-    ),
-    (
-        "unproven",
-        "no visit can be predicted from the others: there is no left-out error",
-        {"WARN": "measure more configurations than the parameters need"},
-    ),
-    (
-        "left_out",
-        "visits left out in turn: {achieved} achieved where {predicted} were predicted",
-        {"PASS": ""}
-        | _each("the visits contradict the error model: look at the rejected points first", "WARN", "FAIL"),
-    ),
-    (
-        "no_gain_left_out",
-        "visits left out in turn are no better than before: {after}, before {before}",
-        {"FAIL": "do not apply it: free fewer parameters or measure more"},
-    ),
-    (
-        "required_accuracy: left out",
-        "visits left out in turn: {achieved} achieved, {noise}, where {required} are required",
-        {"PASS": "", "FAIL": "measure more, or calibrate closer to the task"},
-    ),
-    (
-        "error_model",
-        "the robot errs beyond its geometry ({terms} at the measured points): this is part of every prediction, "
-        "but a URDF holds placement alone, with which visits left out in turn err by {alone} and not {complete}",
-        {"PASS": "where that is too much, correct the joint targets: calib-planner compensate"},
-    ),
-    (
-        "no_gain_held_out",
-        "{points} are no better than before: {after}, before {before}",
-        {"FAIL": "do not apply it: free fewer parameters or measure more"},
-    ),
-    (
-        "predicted_and_achieved",
-        "{points}: {achieved} achieved where {predicted} were predicted",
-        {"PASS": ""} | _each("they lie elsewhere than the measured points, or the robot changed", "WARN", "FAIL"),
-    ),
-    (
-        "region",
-        "{points}: only {share} % lie in the regions where 95 % were expected",
-        {"WARN": "compare the two sets: temperature, the tracker's place, the target's seat, load"},
-    ),
 )
 LIMITS = {"rejected": (0.05, 0.20), "predicted_and_achieved": (APART, 3.0), "left_out": (APART, 3.0)}
-"""Reason → share of the points, and achieved over predicted error, beyond which its level is WARN and FAIL."""
+"""Reason → share of the points, and achieved over predicted error as far as chance does not explain it, beyond
+which its level is WARN and FAIL."""
 RULES = {key: Rule(key.partition(":")[0], text, advice) for key, text, advice in _TABLE}
-"""Everything that a verdict on an estimate can say, in the order of the checks. A key is the code, with a word
+"""Everything that a verdict on an estimate can say, the most important first. A key is the code, with a word
 behind it where one code has several texts."""
+_IMPORTANCE = {code: rank for rank, code in reversed(list(enumerate(rule.code for rule in RULES.values())))}
 
 
 def _graded(code: str, value: float, **values: object) -> Reason:
@@ -191,9 +217,10 @@ def judged(estimate: Estimate) -> Estimate:
 
 
 def judge(estimate: Estimate) -> Verdict:
-    """The verdict on everything else that the estimate says."""
+    """The verdict on everything else that the estimate says; of one level the most important reason first."""
     checks = (_solution, _data, _rejections, _scatter, _left_out, _parameters, _accuracy, _held_out)
-    return Verdict.of([reason for check in checks for reason in check(estimate)])
+    reasons = [reason for check in checks for reason in check(estimate)]
+    return Verdict.of(sorted(reasons, key=lambda r: _IMPORTANCE[r.code]))
 
 
 def _solution(e: Estimate) -> Iterator[Reason]:
@@ -202,10 +229,17 @@ def _solution(e: Estimate) -> Iterator[Reason]:
     before, after = e.residuals.before, e.residuals.after
     if after.rms > LARGEST_RESIDUAL:
         yield RULES["large_residuals"].reason(after=length(after.rms))
-    elif after.rms > LARGE_RESIDUAL:
+    elif after.rms > max(LARGE_RESIDUAL, LITTLE * before.rms):
         yield RULES["explained_little"].reason(before=length(before.rms), after=length(after.rms))
     elif after.mean > 0.9 * before.mean:
-        yield RULES["no_gain"].reason(before=length(before.mean), after=length(after.mean))
+        level = "PASS" if _is_noise(e, before.rms) else "WARN"
+        yield RULES["no_gain"].reason(level, before=length(before.mean), after=length(after.mean))
+
+
+def _is_noise(e: Estimate, rms: float) -> bool:
+    """Whether the noise that is stated explains distances of ``rms`` [m] at the points used."""
+    stated = e.noise.source != "residuals"
+    return stated and rms <= np.sqrt(3.0) * e.noise.sigma * chance_of(3.0 * e.points.used)
 
 
 def _data(e: Estimate) -> Iterator[Reason]:
@@ -243,22 +277,48 @@ def _left_out(e: Estimate) -> Iterator[Reason]:
     terms = [f"{t.name} {length(t.size)}" for t in e.terms if t.kept and t.name in SYSTEMATIC]
     if terms:
         alone, complete = length(e.placement_alone.rms), length(left.rms)
-        yield RULES["error_model"].reason(terms=", ".join(terms), alone=alone, complete=complete)
+        level = "WARN" if _needs_all_terms(e) else "PASS"
+        yield RULES["error_model"].reason(level, terms=", ".join(terms), alone=alone, complete=complete)
     if not left.count:
         yield RULES["unproven"].reason()
         return
-    if left.mean >= before:
+    factor = chance_of(left.freedom)
+    if factor > APART:
+        said = f"{factor:.2g}" if np.isfinite(factor) else "any number of"
+        yield RULES["too_few_measurements"].reason(factor=said)
+    if left.mean >= before and not e.accuracy.overall < before:
         yield RULES["no_gain_left_out"].reason(after=length(left.mean), before=length(before))
-    achieved, ratio = length(left.rms), left.rms / left.predicted_rms
-    yield _graded("left_out", ratio, achieved=achieved, predicted=length(left.predicted_rms))
-    if np.isfinite(required):
-        of_it = f"of it {length(left.noise_rms)} the measurement's"
-        yield RULES["required_accuracy: left out"].reason(
-            "PASS" if left.robot_rms <= required else "FAIL",
-            achieved=achieved,
-            noise=of_it if left.noise_rms > 0 else "the measurement's part included",
-            required=length(required),
-        )
+    predicted = length(left.predicted_rms)
+    yield _graded("left_out", _exceeded(left), achieved=length(left.rms), predicted=predicted)
+    if np.isfinite(required) and not len(e.accuracy.predicted):
+        yield _achieved("required_accuracy: left out", left, required)
+
+
+def _needs_all_terms(e: Estimate) -> bool:
+    """Whether all terms reach what is required, and placement alone does not."""
+    accuracy = e.accuracy
+    if len(accuracy.predicted):
+        return bool(accuracy.worst <= accuracy.required < np.max(accuracy.placement))
+    return e.left_out.robot_rms <= accuracy.required < e.placement_alone.robot_least
+
+
+def _exceeded(achieved: LeftOutError | Validation) -> float:
+    """Achieved over predicted error, as far as chance does not explain it; 0 without points."""
+    ratio = achieved.rms / achieved.predicted_rms / chance_of(achieved.freedom)
+    return float(np.nan_to_num(ratio))
+
+
+def _achieved(key: str, achieved: LeftOutError | Validation, required: float, **values: object) -> Reason:
+    """Whether the robot's own part of what is achieved is what is required."""
+    level = "PASS" if achieved.robot_rms <= required else "WARN" if achieved.robot_least <= required else "FAIL"
+    of_it = f"of it {length(achieved.noise_rms)} the measurement's"
+    return RULES[key].reason(
+        level,
+        achieved=length(achieved.rms),
+        noise=of_it if achieved.noise_rms > 0 else "the measurement's part included",
+        required=length(required),
+        **values,
+    )
 
 
 def _parameters(e: Estimate) -> Iterator[Reason]:
@@ -279,8 +339,10 @@ def _accuracy(e: Estimate) -> Iterator[Reason]:
     if np.isinf(predicted).any():
         yield RULES["blind_test_pose"].reason(count=int(np.isinf(predicted).sum()), poses=len(predicted))
     if np.isfinite(required) and len(predicted):
-        worst = e.accuracy.worst
-        level = "PASS" if worst <= required else "FAIL"
+        worst = e.accuracy.worst * max(1.0, _exceeded(e.left_out))
+        # Where nobody states the noise, the scatter of the residuals is what the prediction rests on.
+        least = worst / (chance_of(e.left_out.freedom) if e.noise.source == "residuals" else 1.0)
+        level = "PASS" if worst <= required else "WARN" if least <= required else "FAIL"
         yield RULES["required_accuracy"].reason(level, worst=length(worst), required=length(required))
 
 
@@ -290,22 +352,14 @@ def _held_out(e: Estimate) -> Iterator[Reason]:
 
 
 def _validation(v: Validation, points: str, required: float) -> Iterator[Reason]:
-    achieved = length(v.rms)
     if v.mean >= v.before_mean:
         yield RULES["no_gain_held_out"].reason(points=points, after=length(v.mean), before=length(v.before_mean))
-    ratio = v.rms / v.predicted_rms
-    if np.isfinite(ratio):
-        predicted = length(v.predicted_rms)
-        yield _graded("predicted_and_achieved", ratio, points=points, achieved=achieved, predicted=predicted)
+    if np.isfinite(v.predicted_rms):
+        achieved, predicted = length(v.rms), length(v.predicted_rms)
+        yield _graded(
+            "predicted_and_achieved", _exceeded(v), points=points, achieved=achieved, predicted=predicted
+        )
     if v.count >= MANY and v.within_95 < INSIDE:
         yield RULES["region"].reason(points=points, share=f"{100 * v.within_95:.0f}")
     if np.isfinite(required):
-        # The requirement is about the robot; the achieved error contains the measurement's noise as well.
-        of_it = f"of it {length(v.noise_rms)} the measurement's"
-        yield RULES["required_accuracy: held out"].reason(
-            "PASS" if v.robot_rms <= required else "FAIL",
-            points=points,
-            achieved=achieved,
-            noise=of_it if v.noise_rms > 0 else "the measurement's part included",
-            required=length(required),
-        )
+        yield _achieved("required_accuracy: held out", v, required, points=points)
