@@ -296,9 +296,9 @@ class Robot:
     def _check_q(self, q: ArrayLike) -> FloatArray:
         return check_configurations("configurations", q, self.joint_names)
 
-    def _check_deviations(self, deviations: ArrayLike | None) -> FloatArray:
+    def _check_deviations(self, deviations: ArrayLike | None) -> FloatArray | None:
         if deviations is None:
-            return np.zeros(len(self.parameter_names))
+            return None
         meaning = f"deviations of {', '.join(self.parameter_names)}"
         return check_array("deviations", deviations, (len(self.parameter_names),), meaning=meaning)
 
@@ -349,20 +349,20 @@ class Robot:
             known[key] = compile_program(structure)
         return known[key]
 
-    def _amounts(self, deviations: NDArray[Any]) -> NDArray[Any]:
-        if not deviations.any():
+    def _amounts(self, deviations: NDArray[Any] | None) -> NDArray[Any]:
+        if deviations is None or not deviations.any():
             return self._nominal_amounts
         amounts = self._nominal_amounts.astype(np.result_type(deviations, np.float64))
         amounts[list(self._layout.parameter_elements)] += deviations
         return amounts
 
-    def _run(self, q: NDArray[Any], deviations: NDArray[Any], *, columns: bool) -> NDArray[Any]:
+    def _run(self, q: NDArray[Any], deviations: NDArray[Any] | None, *, columns: bool) -> NDArray[Any]:
         """Rows of the program; ``q`` (N, joints), real or complex."""
         amounts = self._amounts(deviations)
         wanted = self._layout.parameter_elements if columns else ()
         return self._program(amounts, wanted, ()).run(np.ascontiguousarray(q.T), amounts)
 
-    def _linearise(self, q: NDArray[Any], deviations: NDArray[Any]) -> Linearisation:
+    def _linearise(self, q: NDArray[Any], deviations: NDArray[Any] | None) -> Linearisation:
         lay = self._layout
         amounts = self._amounts(deviations)
         both = lay.parameter_elements + lay.joint_elements

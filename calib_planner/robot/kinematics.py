@@ -25,21 +25,29 @@ from one tangent of the half angle,
 
     t = tan(q/2),   d = 2/(1 + t²),   cos q = d − 1,   sin q = t·d,
 
-which NumPy vectorises where it does not vectorise sine and cosine. The program depends on the chain's *structure*
-(which amounts are zero or quarter turns), not on its numbers, so that one program serves a whole identification.
+which NumPy vectorises where it does not vectorise sine and cosine. ``kernel.c`` does the same in one call and
+saves the time that NumPy takes per operation; where it is not built, and for complex numbers, NumPy does it.
+
+The program depends on the chain's *structure* (which amounts are zero or quarter turns), not on its numbers, so
+that one program serves a whole identification.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_planner.robot.elements import Element
+
+try:
+    from calib_planner.robot import _kernel  # type: ignore[attr-defined]
+except ImportError:  # not built: NumPy does the same, more slowly
+    _kernel = None
 
 GENERAL = -1
 """Structure code of an amount that may be any number; 0..3 are exact quarter turns, 0 also zero length."""
@@ -324,6 +332,14 @@ class Program:
             Array of shape (rows, N): positions 3 per target, then 3 per target of each wanted column, then
             3 of each wanted axis, then 3 of each wanted origin; all in the base frame.
         """
+        if _kernel is not None and q.dtype == amounts.dtype == np.float64:
+            out = np.empty((self.rows, q.shape[1]))
+            _kernel.run(self.code, amounts, q, out)
+            return out
+        return self.run_numpy(q, amounts)
+
+    def run_numpy(self, q: NDArray[Any], amounts: NDArray[Any]) -> NDArray[Any]:
+        """The same without the compiled kernel; also for complex numbers."""
         dtype = np.result_type(q.dtype, amounts.dtype, np.float64)
         count = q.shape[1]
         out = np.empty((self.rows, count), dtype)
@@ -357,6 +373,19 @@ class Program:
                 else:
                     np.negative(table[slot], block[row])
         return out
+
+    @cached_property
+    def code(self) -> NDArray[np.int32]:
+        """The program as numbers for ``kernel.c``, whose ``unpack`` has the layout."""
+        scalar = [(_SCALARS.index(op), a, b, node) for op, a, b, node in self.scalars]
+        vector = [(_VECTORS.index(ufunc), a, b, slot) for ufunc, a, b, slot in self.vectors]
+        parts = (scalar, vector, self.turns, self.joints, self.constants, self.copies, self.registers)
+        counts = [len(part) for part in parts]
+        joints = 1 + max([j for _, j in self.joints] + [t[0] for t in self.turns], default=-1)
+        nodes = 1 + max([0, *(s[3] for s in self.scalars)])
+        head = [*counts[:3], joints, *counts[3:6], self.slots, self.rows, counts[6]]
+        flat = [number for part in parts for entry in part for number in entry]
+        return np.array([*head, self.scratch, nodes, *flat], np.int32)
 
     def _turn(self, q: NDArray[Any], numbers: dict[int, Any], angles: NDArray[Any], waves: NDArray[Any]) -> None:
         """Cosines and sines of the joint angles of one block, (turns, n), into ``waves`` (2, turns, n)."""
@@ -399,6 +428,9 @@ def compile_program(structure: Structure) -> Program:
     return min(candidates, key=lambda program: len(program.vectors) + len(program.copies))
 
 
+_SCALARS = ("amount", "cos", "sin", "mul", "add", "sub")
+_VECTORS = (np.multiply, np.add, np.subtract)
+"""Operations in the order in which ``kernel.c`` numbers them."""
 _UFUNCS: dict[str, Callable[..., Any]] = {"mul": np.multiply, "add": np.add, "sub": np.subtract}
 
 
