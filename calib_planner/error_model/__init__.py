@@ -14,7 +14,7 @@ from calib_planner.error_model.knowledge import (
     error_variance,
     without_rigid_motion,
 )
-from calib_planner.error_model.model import ErrorModel, Scale
+from calib_planner.error_model.model import MEANINGS, ErrorModel, Scale
 from calib_planner.error_model.placement import Placement
 from calib_planner.error_model.points import Points
 from calib_planner.error_model.poses import Poses
