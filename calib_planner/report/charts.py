@@ -186,12 +186,12 @@ class Row(NamedTuple):
 class ComparedSet(NamedTuple):
     """Points whose distances are compared: name for people, then places in the report's JSON, empty: it has none.
 
-    ``key`` has mean, rms, max and, if ``predicted``, predicted_rms; ``alone`` the same of placement alone.
+    ``number`` is their number; ``key`` has mean, rms, max and, if ``predicted``, predicted_rms; ``alone`` the same of placement alone.
     """
 
     name: str
     key: str
-    count: str
+    number: str
     before: str
     alone: str
     predicted: bool
