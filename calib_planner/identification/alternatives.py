@@ -801,3 +801,434 @@ def _ranges(rows: tuple[int, ...]) -> str:
         else:
             parts.append([row])
     return listed([f"{p[0]}–{p[-1]}" if len(p) > 1 else p[0] for p in parts], 5)
+
+
+# ── gross: what is assumed is so wrong that no fit makes sense ───────────────────────────────────────
+
+GROSS = 0.01
+"""Share of the robot's extent beyond which no industrial robot errs: ten times what zeros alone left on real arms."""
+SOUND = 0.02
+"""The same below which a change has to bring it: gravity and tolerances, which are not fitted here, are in it."""
+CLEAR = 3.0
+"""Factor by which the residuals have to fall: what is left is then a ninth of the sum of squares."""
+TIE = 2.0
+"""Changes whose residuals differ by less than this factor explain the data equally well."""
+UNITS = {"millimetres": 1e3, "centimetres": 1e2, "inches": 1.0 / 0.0254, "feet": 1.0 / 0.3048}
+"""Unit → how many of it a metre has."""
+NEAR = 0.03
+"""Relative distance of an estimated scale from that of a unit, or from one, within which it is that."""
+FAR_APART = 3.0
+"""A ratio of spreads beyond which the unit of the points is wrong, whatever else is."""
+WHOLE_TURNS = 4.0 * np.pi
+"""Angles beyond this are degrees [rad]."""
+RANK_ROUNDS, FIT_ROUNDS = 3, 8
+"""Rounds of weights while changes are ranked, and of a fit of the zeros."""
+MOST_ROWS = 60
+"""Rows that are tried, evenly spread."""
+PREFERRED = ("sign", "columns", "targets", "rows", "couple", "zero")
+"""Discrete changes, the one to name first if several explain the same: a wrist bends the other way if its middle
+joint changes its sign, or if the joint before it is turned by half."""
+FITTED = ("scale", "ratio", "setup")
+"""Changes with an amount that is fitted, or with more unknowns, in the same order."""
+CANDIDATES = 8
+"""Changes whose zeros are fitted, those that leave least without."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """One discrete change of the data or of what is unknown.
+
+    Attributes:
+        code: Row of the table.
+        words: What fills its braces.
+        q, p: (N, joints), (N, targets, 3) changed [rad | m], [m].
+        more: Fields of the alternative, ``size`` and ``unit`` among them.
+        base, tool: Whether these are unknown.
+        scale: Whether a factor on all distances is fitted.
+        ratio: Joint whose gear ratio is fitted, or ``None``.
+        metre: How many of the data's units ``p`` takes for a metre.
+    """
+
+    code: str
+    words: dict[str, Any]
+    q: FloatArray
+    p: FloatArray
+    more: dict[str, Any]
+    base: bool
+    tool: bool
+    metre: float = 1.0
+    scale: bool = False
+    ratio: int | None = None
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What a change leaves: median distance of a point [m], the scale and the ratio that were fitted."""
+
+    level: float
+    scale: float = 1.0
+    ratio: float = 1.0
+    spare: int = 0
+
+
+def explain_gross(robot: Robot, data: Measurements) -> Alternative | None:
+    """The one change that makes sense of data which the robot as described does not explain at all.
+
+    To be called when a fit fails, or at any time: data that base, targets and zeros explain as well as an industrial
+    robot allows need no explanation.
+
+    Args:
+        robot: Nominal; base and targets are placed if their parameters are active.
+        data: The measurements.
+
+    Returns:
+        ``None`` if nothing is grossly wrong, if no single change explains it, or if several do that have nothing to
+        do with each other.
+    """
+    gross = _Gross(robot, data.in_order_of(robot.joint_names))
+    return gross.explanation()
+
+
+class _Gross:
+    """The changes and what they leave."""
+
+    def __init__(self, robot: Robot, data: Measurements) -> None:
+        active = set(robot.parameter_names)
+        self.base = active.issuperset(BASE_PARAMETERS)
+        self.tool = active.issuperset(target_parameters(len(robot.targets)))
+        rows = np.flatnonzero(data.seen.any(axis=1))
+        self.robot, self.q, self.p = robot, data.q[rows], data.p[rows]
+        self.turns = robot.joint_is_revolute
+        origin = robot.with_base(np.eye(3), np.zeros(3))
+        frame = np.vstack([np.zeros(3), np.eye(3)])
+        self.tips = replace(origin, parameter_names=()).with_targets(frame)
+        self.count = 0
+
+    def explanation(self) -> Alternative | None:
+        """See ``explain_gross``."""
+        if len(self.q) < 2:
+            return None
+        plain = self._change("", self.q, self.p)
+        before = self._left(plain, fit=True)
+        if before.spare < SPARE or before.level < GROSS * self._extent(self.q):
+            return None
+        base, after = self._units(plain, before)
+        limit = SOUND * self._extent(base.q)
+        before = replace(before, level=before.level / base.metre)
+        if base is not plain and after.level < min(limit, before.level / CLEAR):
+            return self._told([base], before, after)
+        several, after = self._best(base, after)
+        if not several:
+            return None
+        return self._told(several if base is plain else [several[0]], before, after, None if base is plain else base)
+
+    # ── changes ──────────────────────────────────────────────────────────────────────────────────────
+
+    def _change(self, code: str, q: FloatArray, p: FloatArray, **more: Any) -> _Change:
+        words = more.pop("words", {})
+        base, tool = more.pop("base", self.base), more.pop("tool", self.tool)
+        scale, ratio, metre = more.pop("scale", False), more.pop("ratio", None), more.pop("metre", 1.0)
+        return _Change(code, words, q, p, more, base, tool, metre, scale, ratio)
+
+    def _units(self, plain: _Change, before: _Left) -> tuple[_Change, _Left]:
+        """The data in metres and radians, as far as that is clear, and what they leave."""
+        best, least = plain, before
+        spread = _spread(self.p) / max(_spread(self._tip(self.q)[1][:, None]), 1e-9)
+        factors = {"radians": 1.0, "degrees": np.pi / 180.0, "too small": 180.0 / np.pi}
+        for angle, factor in factors.items():
+            q = np.where(self.turns, self.q * factor, self.q)
+            about = _spread(self.p) / max(_spread(self._tip(q)[1][:, None]), 1e-9)
+            free = self._left(self._change("", q, self.p / about, scale=True))
+            for scale in self._scales(about, about * free.scale):
+                change = self._in_units(angle, scale, q)
+                if change is None:
+                    continue
+                left = self._left(change, fit=True)
+                # In the units of the data: whatever makes the robot small leaves little of its metres.
+                if left.level * change.metre < least.level * best.metre / CLEAR:
+                    best, least = change, left
+        if best is not plain:
+            return best, least
+        # Something else is wrong too; what cannot be otherwise is changed before that is looked for.
+        turning = np.abs(self.q[:, self.turns]).max(initial=0.0)
+        angle = "degrees" if turning > WHOLE_TURNS else "radians"
+        q = np.where(self.turns, self.q * factors[angle], self.q)
+        far = not 1.0 / FAR_APART < spread < FAR_APART
+        change = self._in_units(angle, self._scales(spread, spread)[0] if far else 1.0, q)
+        return (plain, before) if change is None else (change, self._left(change, fit=True))
+
+    @staticmethod
+    def _scales(*estimates: float) -> list[float]:
+        """Units of the points to try: the ones next to the estimates, and metres."""
+        all_of_them = np.array([1.0, *UNITS.values(), 1.0 / UNITS["millimetres"]])
+        near = {float(all_of_them[np.argmin(np.abs(np.log(all_of_them / max(e, 1e-9))))]) for e in estimates}
+        return [*near, 1.0] if 1.0 not in near else list(near)
+
+    def _in_units(self, angle: str, scale: float, q: FloatArray) -> _Change | None:
+        """Points with ``scale`` units to the metre, angles as named; ``None``: as they are."""
+        texts, advice = [], []
+        unit = next((u for u, s in UNITS.items() if s == scale), None)
+        if unit is not None:
+            texts.append(f"the points are in {unit}")
+            given = f"multiply the coordinates in the data by {1.0 / scale:.6g}"
+            advice.append("add --millimetres" if unit == "millimetres" else given)
+        elif scale < 1.0:
+            texts.append("the points are a thousand times too close together")
+            advice.append("leave out --millimetres if the points are in metres, or give the robot's lengths in metres")
+        if angle == "degrees":
+            texts.append("the joint angles are in degrees")
+            advice.append("add --degrees")
+        elif angle == "too small":
+            texts.append("the joint angles are 57.3 times too small, as radians are that were read as degrees")
+            advice.append("leave out --degrees")
+        if not texts:
+            return None
+        words = {"size": " and ".join(texts), "advice": ", and ".join(advice)}
+        size, name = (scale, "1") if scale != 1.0 else (180.0 / np.pi, "1")
+        return self._change("units", q, self.p / scale, words=words, size=size, unit=name, metre=scale)
+
+    def _changes(self, start: _Change) -> Iterator[_Change]:
+        """Every other gross row of the table, applied to ``start``."""
+        q, p, names = start.q, start.p, self.robot.joint_names
+        moving = [j for j in range(len(names)) if np.ptp(q[:, j]) > 1e-6]
+        for j in moving:
+            yield self._change(
+                "sign", _with_column(q, j, -q[:, j]), p, words={}, size=-1.0, unit="1", joint=names[j]
+            )
+        for j in np.flatnonzero(self.turns).tolist():
+            for degrees in (90, -90, 180):
+                turned = _with_column(q, j, q[:, j] + np.deg2rad(degrees))
+                words = {"size": f"{degrees:+d}".replace("-", "−")}
+                yield self._change("zero", turned, p, words=words, size=degrees, unit="deg", joint=names[j])
+        for j, k in permutations(moving, 2):
+            if self.turns[j] == self.turns[k]:
+                for sign, word in ((1.0, "+"), (-1.0, "−")):
+                    both = _with_column(q, j, q[:, j] + sign * q[:, k])
+                    pair = {"joint": names[j], "beside": names[k]}
+                    yield self._change("couple", both, p, words={"size": word}, size=sign, unit="1", **pair)
+        for j, k in combinations(range(len(names)), 2):
+            if self.turns[j] == self.turns[k]:
+                other = _with_column(_with_column(q, j, q[:, k]), k, q[:, j])
+                yield self._change("columns", other, p, size=0.0, unit="1", joint=names[j], beside=names[k])
+        targets = p.shape[1]
+        if not self.tool and 1 < targets < 5:
+            for order in list(permutations(range(targets)))[1:]:
+                pair_of = listed([t + 1 for t in range(targets) if order[t] != t], 5)
+                words = {"size": pair_of, "where": " in every row"}
+                yield self._change("targets", q, p[:, order], words=words, size=0.0, unit="1")
+        for shift in (1, -1, 2, -2):
+            if len(q) > 2 * abs(shift):
+                moved = np.full(p.shape, np.nan)
+                moved[max(-shift, 0) : len(q) - max(shift, 0)] = p[max(shift, 0) : len(q) + min(shift, 0)]
+                side = "below" if shift > 0 else "above"
+                text = f"every point stands {counted(abs(shift), 'row')} {side} the joint values it belongs to"
+                yield self._change("rows", q, moved, words={"size": text}, size=shift, unit="1")
+        text = "the points are in the reverse order of the joint values"
+        yield self._change("rows", q, p[::-1], words={"size": text}, size=0.0, unit="1")
+
+    def _fitted_changes(self, start: _Change) -> Iterator[_Change]:
+        """Changes with an amount that is fitted, or with more unknowns."""
+        q, p, names = start.q, start.p, self.robot.joint_names
+        for j in range(len(names)):
+            if np.ptp(q[:, j]) > 1e-6:
+                yield self._change("ratio", q, p, unit="1", joint=names[j], ratio=j)
+        yield self._change("scale", q, p, unit="1", scale=True)
+        for base, tool in ((True, self.tool), (self.base, True), (True, True)):
+            new = [w for w, there, was in (("base", base, self.base), ("tool", tool, self.tool)) if there and not was]
+            if new:
+                who = {"base": "base is", "tool": "targets are", "base,tool": "base and the targets are"}
+                option = ",".join(new)
+                them = "it" if option == "base" else "them"
+                unknown = [w for w, there in (("base", base), ("tool", tool)) if there]
+                words = {"size": who[option], "them": them, "option": ",".join(unknown)}
+                yield self._change("setup", q, p, words=words, size=0.0, unit="m", base=base, tool=tool)
+
+    def _best(self, start: _Change, left: _Left) -> tuple[list[_Change], _Left]:
+        """The change that leaves least, with those that leave as little; and what it leaves."""
+        changes = list(self._changes(start))
+        ranked = sorted(changes, key=lambda c: self._left(c).level)[:CANDIDATES]
+        some = [*ranked, *self._fitted_changes(start)]
+        self.count = len(changes) + len(some) - len(ranked)
+        fits = [(c, self._left(c, fit=True)) for c in some]
+        # More unknowns leave less by themselves: a discrete change that explains the data goes before them.
+        sound = min(SOUND * self._extent(start.q), left.level / CLEAR)
+        for codes in (PREFERRED, FITTED):
+            those = [f for f in fits if f[0].code in codes]
+            least = min((f[1].level for f in those), default=np.inf)
+            if least < sound:
+                equal = [f for f in those if f[1].level < TIE * least]
+                first = min(equal, key=lambda f: _simplest(f[0], f[1].level))
+                same = [f[0] for f in equal if f is not first] if codes is PREFERRED else []
+                return [first[0], *same], first[1]
+        return [], left
+
+    # ── what is left ─────────────────────────────────────────────────────────────────────────────────
+
+    def _tip(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotations (N, 3, 3) and origins (N, 3) of the tip in the robot's own frame."""
+        points = self.tips.positions(q)
+        return (points[:, 1:] - points[:, :1]).transpose(0, 2, 1), points[:, 0]
+
+    def _extent(self, q: FloatArray) -> float:
+        """How far the tip is from where it is on the median [m]."""
+        return _spread(self._tip(q)[1][:, None])
+
+    def _left(self, change: _Change, *, fit: bool = False) -> _Left:
+        """What is left with base and targets placed as far as they are unknown; ``fit``: and zeros fitted."""
+        rows = np.flatnonzero(~np.isnan(change.p[:, :, 0]).all(axis=1))
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_ROWS).astype(int))]
+        try:
+            return self._fitted(change, change.q[rows], change.p[rows], FIT_ROUNDS if fit else RANK_ROUNDS, fit)
+        except (NotEnoughDataError, np.linalg.LinAlgError):
+            return _Left(np.inf, spare=SPARE)
+
+    def _fitted(self, change: _Change, q: FloatArray, p: FloatArray, rounds: int, fit: bool) -> _Left:
+        """Rounds of placing, weighing and, with ``fit``, a step of zeros and ratio."""
+        robot, seen = self.robot, ~np.isnan(p[:, :, 0])
+        weights, zeros, ratio, scale = seen.astype(float), np.zeros(q.shape[1]), 1.0, 1.0
+        level = np.inf
+        for _ in range(rounds):
+            moved = q + zeros
+            if change.ratio is not None:
+                moved[:, change.ratio] += (ratio - 1.0) * q[:, change.ratio]
+            tips = self._tip(moved)
+            data = Measurements(robot.joint_names, moved, p / scale)
+            if change.base or change.tool:
+                poses = tips if change.base else _carried(tips, robot.base_pose)
+                put = place(robot, data, poses, base=change.base, tool=change.tool, weights=weights)
+                rotation = put.rotation if change.base else robot.base_pose[0]
+                offsets, points = put.offsets, put.positions(poses)
+            else:
+                rotation, offsets = robot.base_pose[0], robot.target_offsets
+                turned, origins = _carried(tips, robot.base_pose)
+                points = offsets @ turned.transpose(0, 2, 1) + origins[:, None]
+            apart = np.where(seen[:, :, None], data.p - points, 0.0)
+            lengths = np.linalg.norm(apart, axis=2)
+            level = float(np.median(lengths[seen]))
+            weights = np.where(seen, 1.0 / (1.0 + (lengths / max(level, 1e-9)) ** 2), 0.0)
+            if change.scale and not fit:
+                scale *= _stretch(data.p, points, weights, free=change.base)
+            if fit:
+                step = self._step(change, moved, q, (rotation, offsets, points), apart, (weights, max(level, 1e-6)))
+                zeros += step[:-1]
+                if change.scale:
+                    scale *= 1.0 + step[-1]
+                else:
+                    ratio += step[-1]
+        unknown = 6 * change.base + 3 * p.shape[1] * change.tool + (len(zeros) if fit else 0)
+        spare = 3 * int(seen.sum()) - unknown - int(change.scale) - int(change.ratio is not None)
+        if spare <= 0:
+            return _Left(np.inf)
+        return _Left(level * float(np.sqrt(3 * seen.sum() / spare)), scale, ratio, spare)
+
+    def _step(
+        self,
+        change: _Change,
+        moved: FloatArray,
+        q: FloatArray,
+        placed: tuple[FloatArray, FloatArray, FloatArray],
+        apart: FloatArray,
+        how: tuple[FloatArray, float],
+    ) -> FloatArray:
+        """(joints + 1,) step of the zeros within ``ZERO`` and of ratio or scale, base and targets beside them."""
+        (rotation, offsets, points), (weights, level) = placed, how
+        n, targets = points.shape[:2]
+        joints = q.shape[1]
+        levers = self.tips.joint_jacobian(moved).reshape(n, 4, 3, joints)
+        sides = levers[:, 1:] - levers[:, :1]
+        at = levers[:, :1] + np.einsum("ta,nack->ntck", offsets, sides)
+        at = np.einsum("dc,ntck->ntdk", rotation, at)
+        columns = [at]
+        amount = change.scale or change.ratio is not None
+        if change.scale:
+            columns.append(points[..., None])
+        elif change.ratio is not None:
+            columns.append(at[..., [change.ratio]] * q[:, change.ratio][:, None, None, None])
+        if change.base:
+            columns.append(_split(_station(points, np.zeros(3)), targets))
+        if change.tool:
+            turned = rotation @ self._tip(moved)[0]
+            columns += [_split(_at_target(turned, t, targets), targets) for t in range(targets)]
+        root = np.sqrt(weights)[:, :, None, None] / level
+        rows = (np.concatenate(columns, axis=3) * root).reshape(3 * n * targets, -1)
+        prior = np.zeros((joints, rows.shape[1]))
+        prior[:, :joints] = np.eye(joints) / ZERO
+        right = np.append((apart[..., None] * root).ravel(), -(moved - q)[0] / ZERO)
+        if change.ratio is not None:
+            right[len(rows) + change.ratio] = 0.0
+        solution = np.linalg.lstsq(np.vstack([rows, prior]), right, rcond=1e-9)[0]
+        return np.append(solution[:joints], solution[joints] if amount else 0.0)
+
+    # ── the words ────────────────────────────────────────────────────────────────────────────────────
+
+    def _told(self, changes: list[_Change], before: _Left, after: _Left, units: _Change | None = None) -> Alternative:
+        """The alternative in words; of several that explain the same thing all are named."""
+        first = changes[0]
+        more = dict(first.more)
+        words = dict(first.words)
+        if first.code in ("ratio", "scale"):
+            size = after.ratio if first.code == "ratio" else after.scale
+            words["size"], more["size"] = f"{size:.5g}", size - 1.0
+        size, unit = more.pop("size"), more.pop("unit")
+        told = _named(first.code, size, unit, words, **more)
+        others = [_named(c.code, 0.0, "1", c.words, **_fields(c)) for c in changes[1:]]
+        text, advice = told.text, told.advice
+        for other in others[:2]:
+            text, advice = f"{text}, or {other.text}", f"{advice}; or {other.advice}"
+        if units is not None:
+            text, advice = f"{units.words['size']}, and {text}", f"{units.words['advice']}, and {advice}"
+        ratio = before.level / max(after.level, 1e-12)
+        nats = after.spare * float(np.log(ratio)) if np.isfinite(ratio) else np.inf
+        return replace(
+            told,
+            text=text,
+            advice=advice,
+            gain=nats,
+            statistic=ratio,
+            freedom=1,
+            probability=min(1.0, max(self.count, 1) * float(np.exp(-min(nats, 700.0)))),
+            moved=before.level,
+            deviations=ratio,
+            material=True,
+        )
+
+
+def _fields(change: _Change) -> dict[str, Any]:
+    """What of a change are fields of its alternative, without size and unit."""
+    return {k: v for k, v in change.more.items() if k not in ("size", "unit")}
+
+
+def _simplest(change: _Change, level: float) -> tuple[float, ...]:
+    """Smaller for the change to name of several that explain the same data."""
+    if change.code in PREFERRED:
+        return PREFERRED.index(change.code), level
+    return change.code == "setup", change.base + change.tool, level
+
+
+def _with_column(q: FloatArray, joint: int, values: FloatArray) -> FloatArray:
+    """``q`` (N, joints) with other values (N,) of one joint."""
+    result = np.array(q)
+    result[:, joint] = values
+    return result
+
+
+def _spread(points: FloatArray) -> float:
+    """Median distance from the median point [m] of (N, targets, 3): blind to a few gross errors."""
+    flat = points.reshape(-1, 3)
+    flat = flat[~np.isnan(flat[:, 0])]
+    return float(np.median(np.linalg.norm(flat - np.median(flat, axis=0), axis=1)))
+
+
+def _carried(tips: tuple[FloatArray, FloatArray], base: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Rotations and origins of the tip in the frame of the points."""
+    (rotations, origins), (rotation, xyz) = tips, base
+    return rotation @ rotations, origins @ rotation.T + xyz
+
+
+def _stretch(measured: FloatArray, predicted: FloatArray, weights: FloatArray, *, free: bool) -> float:
+    """Factor of the measured points (N, targets, 3) on the predicted ones, about their centre if that is ``free``."""
+    use = weights > 0
+    p, g, w = measured[use], predicted[use], weights[use][:, None]
+    if free:
+        p, g = p - np.sum(w * p, axis=0) / w.sum(), g - np.sum(w * g, axis=0) / w.sum()
+    return float(np.sum(w * p * g) / max(float(np.sum(w * g * g)), 1e-300))
