@@ -1,58 +1,59 @@
 """Does one single change to what was assumed explain the measurements far better? One table of such changes.
 
-An *alternative* is a change of one assumption: the tracker stood still, the points are in metres, joint 4 counts in
-its usual direction. Each is tried, the one that explains the data best is named with its evidence, what it does to
-predictions at the test poses, and what to do. There are two regimes.
+An *alternative* is a change of one assumption: the tracker stood still, the points are in metres, joint 4
+counts in its usual direction. Each is tried, the one that explains the data best is named with its evidence,
+what it does to predictions at the test poses, and what to do. There are two regimes.
 
-*Fine*: the error model fits, and an alternative adds a few columns C to its linear problem (``likelihood``). With
-its P and y the amounts a of these columns, their evidence and the linear problem with them are
+*Fine*: the error model fits, and an alternative adds a few columns C to its linear problem (``likelihood``).
+With its P and y the amounts a of these columns, their evidence and its probability are
 
     G = CᵀPC ,   b = CᵀPy ,   â = G⁻¹ b ,   S = bᵀ G⁻¹ b ,                                                     (1)
     F = (S/d) / ((yᵀPy − S)/(ν − d)) ~ F(d, ν − d)   if nothing is wrong,                                      (2)
 
-d being the rank of G and ν the measured coordinates less the rank of the flat columns. The F ratio needs no level of
-noise, so that a noise stated too small is no drift. For all cuts k (columns that are zero before visit k) G and b
-are sums over the visits k, k + 1, …, had at once. The scales of the error model were estimated without C and may
-have grown to hold what C explains: S is also tried with every scale no larger than a robot of the usual kind has.
-What looks suspicious is then fitted in full: the columns enter as flat ones, the scales are estimated anew, and the
-left-out score must rise (M4). Points that have lost their weight get it back if the columns explain them.
+d being the rank of G and ν the measured coordinates less the rank of the flat columns. The F ratio needs no
+level of noise, so that a noise stated too small is no drift. For all cuts k (columns that are zero before visit
+k) G and b are sums over the visits k, k + 1, …, had at once. The scales of the error model were estimated
+without C and may have grown to hold what C explains: S is also tried with every scale no larger than a robot of
+the usual kind has. What looks suspicious is then fitted in full: the columns enter as flat ones, the scales are
+estimated anew, and the left-out score must rise (M4). Points that have lost their weight get it back if the
+columns explain them.
 
-*Gross*: what is assumed is so wrong that the fit fails or leaves far more than an industrial robot errs by. Base and
-targets are placed in closed form (``registration``) for every change, robustly, the zeros of the joints are fitted
-with them for the best few, and what is left decides.
+*Gross*: what is assumed is so wrong that the fit fails or leaves far more than an industrial robot errs by.
+Base and targets are placed in closed form (``registration``) for every change, robustly, the zeros of the
+joints are fitted with them for the best few, and what is left decides.
 
-Wherever several alternatives explain the same thing the one with the best score is named. *Materiality* is how far
-the predictions at the test poses move if the alternative becomes part of the model, in metres and in predicted
-standard deviations: what moves nothing is a note, whatever its evidence.
+Wherever several alternatives explain the same thing the one with the best score is named. *Materiality* is how
+far the predictions at the test poses move if the alternative becomes part of the model, in metres and in
+predicted standard deviations: what moves nothing is a note, whatever its evidence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.special import chdtri, fdtrc
+from scipy.special import fdtrc
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import Poses, without_rigid_motion
 from calib_planner.error_model.placement import ZERO, is_placement
 from calib_planner.error_model.poses import joint_units
 from calib_planner.errors import InputError, NotEnoughDataError
-from calib_planner.identification.doubt import FEW, FEWEST, gate_of, impossible, part_of, shifted_run
+from calib_planner.identification.doubt import FEWEST, impossible, part_of, shifted_run
 from calib_planner.identification.estimation import ENOUGH, ModelEstimate
 from calib_planner.identification.left_out import left_out
 from calib_planner.identification.likelihood import (
+    UNBOUNDED,
     CoefficientSolution,
     DenseSolution,
-    UNBOUNDED,
     LinearProblem,
     Solution,
+    UpdatedSolution,
     maximise,
     solve,
 )
@@ -142,7 +143,7 @@ TABLE = {
             "fine",
             "all targets together were mounted anew before one of the visits",
             "the targets were mounted anew before row {row}: all sit about {size} elsewhere",
-            "mount them as before and measure these rows again, or identify with the larger part of the rows alone",
+            "mount them as before and measure these rows again, or identify with the larger part of the rows",
         ),
         Row(
             "block",
@@ -399,7 +400,7 @@ class _Fine:
             test_poses = data.q[chosen]
         self.poses = np.asarray(test_poses)
         names = fitted.solution.problem.robot.parameter_names
-        self.here = self._thin(known.poses(data.q), names)
+        self.here = self._thin(known.poses(data.q, data.payload), names)
         self.there = self._thin(known.poses(self.poses), names)
         seen = data.seen
         self.centre = self.here.points[seen].mean(axis=0)
@@ -488,7 +489,9 @@ class _Fine:
 
     def findings(self) -> Iterator[Alternative]:
         """The best alternative, then the best beside it, and so on."""
-        base = _Base(self.problem, self.fitted.doubt, self.fitted.solution.coefficients, self.fitted.left_out.score)
+        base = _Base(
+            self.problem, self.fitted.doubt, self.fitted.solution.coefficients, self.fitted.left_out.score
+        )
         for _ in range(MOST_FINDINGS):
             fits = [self._fitted_in_full(a, d, base) for a, d in self._suspicious(base)]
             better = [f for f in fits if f is not None]
@@ -510,14 +513,21 @@ class _Fine:
                     answer = replace(answer, count=answer.count * len(doubts) * len(problems))
                     q = answer.question
                     key = (q.code, q.target, q.joint, q.beside, q.code == "prior" and len(q.rows))
-                    if answer.counted < SUSPICIOUS and (key not in chosen or _order(answer) < _order(chosen[key][0])):
+                    if answer.counted < SUSPICIOUS and (
+                        key not in chosen or _order(answer) < _order(chosen[key][0])
+                    ):
                         chosen[key] = (answer, doubt)
         return sorted(chosen.values(), key=lambda a: _order(a[0]))[:MOST_FITS]
 
     def _solved(self, problem: LinearProblem, doubt: FloatArray) -> Solution:
         """The solution with these doubts; the one at hand if nothing differs."""
-        if problem is self.problem and (doubt == self.fitted.doubt).all():
-            return self.fitted.solution
+        at_hand = self.fitted.solution
+        if (
+            problem is self.problem
+            and (doubt == self.fitted.doubt).all()
+            and not isinstance(at_hand, UpdatedSolution)
+        ):
+            return at_hand
         return solve(self._with(problem, doubt))
 
     @staticmethod
@@ -554,7 +564,9 @@ class _Fine:
             if question.code == "block":  # chosen from so many runs
                 tried += n * n / 2.0
             yield _answer(solution, question, statistic, tried)
-        some = cuts if len(cuts) <= MOST_CUTS else np.unique(np.linspace(cuts[0], cuts[-1], MOST_CUTS).astype(int))
+        some = (
+            cuts if len(cuts) <= MOST_CUTS else np.unique(np.linspace(cuts[0], cuts[-1], MOST_CUTS).astype(int))
+        )
         for question in questions:
             if question.cut:
                 row, statistic = self._best_cut(solution, question, some)
@@ -572,7 +584,9 @@ class _Fine:
             best = int(np.argmax(values))
         return int(cuts[best]), (float(values[best]), int(ranks[best]))
 
-    def _fitted_in_full(self, answer: _Answer, doubt: FloatArray, base: _Base) -> tuple[Alternative, _Base] | None:
+    def _fitted_in_full(
+        self, answer: _Answer, doubt: FloatArray, base: _Base
+    ) -> tuple[Alternative, _Base] | None:
         """The alternative, and the linear problem with it; ``None``: it explains nothing."""
         question, count = answer.question, base.problem.columns.shape[2]
         solution, doubt = self._settled(_widened(self._with(base.problem, doubt), question.columns), doubt)
@@ -582,7 +596,9 @@ class _Fine:
         if not (again.counted < SIGNIFICANT and score > base.score):
             return None
         amounts, poses = solution.coefficients[count:], self.columns_there.shape[2]
-        change = self.columns_there @ (solution.coefficients - np.append(base.coefficients, 0.0 * amounts))[:poses]
+        change = (
+            self.columns_there @ (solution.coefficients - np.append(base.coefficients, 0.0 * amounts))[:poses]
+        )
         change = change.reshape(question.there.shape[:3]) + question.there @ amounts
         moved, deviations = self._moved(change)
         told = replace(
@@ -614,7 +630,7 @@ class _Fine:
         return self.problem.model.columns(self.there)
 
     def _moved(self, change: FloatArray) -> tuple[float, float]:
-        """Largest distance of ``change`` (K, targets, 3) [m], and the largest in predicted standard deviations."""
+        """Largest distance of ``change`` (K, targets, 3) [m], and in predicted standard deviations."""
         frame = self.frame
         if frame == "robot":
             try:
@@ -759,7 +775,9 @@ def _later(values: FloatArray) -> FloatArray:
 
 def _usual(problem: LinearProblem) -> LinearProblem:
     """``problem`` with no scale larger than a usual robot has; itself if none is."""
-    high = {s.name: s.median * np.sqrt(s.factor) for s in problem.model.scales if not s.known and s.factor < UNBOUNDED}
+    high = {
+        s.name: s.median * np.sqrt(s.factor) for s in problem.model.scales if not s.known and s.factor < UNBOUNDED
+    }
     values = problem.model.values
     swollen = {n: limit for n, limit in high.items() if values[n] > SWOLLEN * limit}
     return problem.at(problem.model.with_values(swollen)) if swollen else problem
@@ -806,7 +824,7 @@ def _ranges(rows: tuple[int, ...]) -> str:
 # ── gross: what is assumed is so wrong that no fit makes sense ───────────────────────────────────────
 
 GROSS = 0.01
-"""Share of the robot's extent beyond which no industrial robot errs: ten times what zeros alone left on real arms."""
+"""Share of its extent beyond which no industrial robot errs: ten times what zeros alone left on real arms."""
 SOUND = 0.02
 """The same below which a change has to bring it: gravity and tolerances, which are not fitted here, are in it."""
 CLEAR = 3.0
@@ -874,16 +892,15 @@ class _Left:
 def explain_gross(robot: Robot, data: Measurements) -> Alternative | None:
     """The one change that makes sense of data which the robot as described does not explain at all.
 
-    To be called when a fit fails, or at any time: data that base, targets and zeros explain as well as an industrial
-    robot allows need no explanation.
+    To be called when a fit fails, or at any time: data that base, targets and zeros explain as well as an
+    industrial robot allows need no explanation.
 
     Args:
         robot: Nominal; base and targets are placed if their parameters are active.
         data: The measurements.
 
     Returns:
-        ``None`` if nothing is grossly wrong, if no single change explains it, or if several do that have nothing to
-        do with each other.
+        ``None`` if nothing is grossly wrong, or if no single change explains it.
     """
     gross = _Gross(robot, data.in_order_of(robot.joint_names))
     return gross.explanation()
@@ -920,7 +937,9 @@ class _Gross:
         several, after = self._best(base, after)
         if not several:
             return None
-        return self._told(several if base is plain else [several[0]], before, after, None if base is plain else base)
+        return self._told(
+            several if base is plain else [several[0]], before, after, None if base is plain else base
+        )
 
     # ── changes ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -974,7 +993,9 @@ class _Gross:
             advice.append("add --millimetres" if unit == "millimetres" else given)
         elif scale < 1.0:
             texts.append("the points are a thousand times too close together")
-            advice.append("leave out --millimetres if the points are in metres, or give the robot's lengths in metres")
+            advice.append(
+                "leave out --millimetres if the points are in metres, or give the robot's lengths in metres"
+            )
         if angle == "degrees":
             texts.append("the joint angles are in degrees")
             advice.append("add --degrees")
@@ -1034,7 +1055,9 @@ class _Gross:
                 yield self._change("ratio", q, p, unit="1", joint=names[j], ratio=j)
         yield self._change("scale", q, p, unit="1", scale=True)
         for base, tool in ((True, self.tool), (self.base, True), (True, True)):
-            new = [w for w, there, was in (("base", base, self.base), ("tool", tool, self.tool)) if there and not was]
+            new = [
+                w for w, there, was in (("base", base, self.base), ("tool", tool, self.tool)) if there and not was
+            ]
             if new:
                 who = {"base": "base is", "tool": "targets are", "base,tool": "base and the targets are"}
                 option = ",".join(new)
@@ -1109,7 +1132,9 @@ class _Gross:
             if change.scale and not fit:
                 scale *= _stretch(data.p, points, weights, free=change.base)
             if fit:
-                step = self._step(change, moved, q, (rotation, offsets, points), apart, (weights, max(level, 1e-6)))
+                step = self._step(
+                    change, moved, q, (rotation, offsets, points), apart, (weights, max(level, 1e-6))
+                )
                 zeros += step[:-1]
                 if change.scale:
                     scale *= 1.0 + step[-1]
@@ -1161,7 +1186,9 @@ class _Gross:
 
     # ── the words ────────────────────────────────────────────────────────────────────────────────────
 
-    def _told(self, changes: list[_Change], before: _Left, after: _Left, units: _Change | None = None) -> Alternative:
+    def _told(
+        self, changes: list[_Change], before: _Left, after: _Left, units: _Change | None = None
+    ) -> Alternative:
         """The alternative in words; of several that explain the same thing all are named."""
         first = changes[0]
         more = dict(first.more)
@@ -1219,14 +1246,16 @@ def _spread(points: FloatArray) -> float:
     return float(np.median(np.linalg.norm(flat - np.median(flat, axis=0), axis=1)))
 
 
-def _carried(tips: tuple[FloatArray, FloatArray], base: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _carried(
+    tips: tuple[FloatArray, FloatArray], base: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Rotations and origins of the tip in the frame of the points."""
     (rotations, origins), (rotation, xyz) = tips, base
     return rotation @ rotations, origins @ rotation.T + xyz
 
 
 def _stretch(measured: FloatArray, predicted: FloatArray, weights: FloatArray, *, free: bool) -> float:
-    """Factor of the measured points (N, targets, 3) on the predicted ones, about their centre if that is ``free``."""
+    """Factor of the measured points (N, targets, 3) on the predicted ones, about their centre if ``free``."""
     use = weights > 0
     p, g, w = measured[use], predicted[use], weights[use][:, None]
     if free:

@@ -79,7 +79,9 @@ class Cell:
     def data(self, points: FloatArray | None = None, q: FloatArray | None = None) -> Measurements:
         """With noise."""
         shown = self.q if q is None else q
-        return Measurements(self.asked.joint_names, shown, (self.points() if points is None else points) + self.noise)
+        return Measurements(
+            self.asked.joint_names, shown, (self.points() if points is None else points) + self.noise
+        )
 
 
 @cache
