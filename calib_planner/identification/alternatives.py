@@ -40,9 +40,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from calib_planner.arrays import FloatArray, IntArray
-from calib_planner.error_model import Poses, without_rigid_motion
-from calib_planner.error_model.placement import ZERO, is_placement
-from calib_planner.error_model.poses import joint_units
+from calib_planner.error_model import ZERO, Poses, joint_units, without_rigid_motion
 from calib_planner.errors import InputError, NotEnoughDataError
 from calib_planner.identification.doubt import FEWEST, impossible, part_of, shifted_run
 from calib_planner.identification.estimation import ENOUGH, ModelEstimate
@@ -59,7 +57,7 @@ from calib_planner.identification.likelihood import (
 )
 from calib_planner.identification.registration import place, tip_poses
 from calib_planner.measurements import Measurements
-from calib_planner.robot import BASE_PARAMETERS, Robot, target_parameters
+from calib_planner.robot import BASE_PARAMETERS, Robot, is_nuisance, target_parameters
 from calib_planner.units import counted, length, listed, milliradians
 
 BoolArray = NDArray[np.bool_]
@@ -72,7 +70,7 @@ MATERIAL = 1.0
 """Predicted standard deviations: a prediction that moves by less errs no more than was promised."""
 MOST_CUTS = 120
 """Cuts between visits that are tried at once; of more visits the neighbourhood of the best is tried anew."""
-MOST_FITS = 8
+MOST_FITS = 5
 """Suspicious alternatives that are fitted in full, the most suspicious ones."""
 MOST_FINDINGS = 3
 """Alternatives that are named."""
@@ -459,6 +457,12 @@ class _Fine:
         run = shifted_run(solution)
         if run is None:
             return
+        first, last = int(run[0]), int(run[-1]) + 1
+        if first == 0 or last == len(self.data):  # a push that turned nothing
+            columns, row = station[0][:, :, :3], last if first == 0 else first
+            there = _split(station[1], len(self.here.robot.targets))[..., :3]
+            yield _Question("push", columns, there).at(row)
+            return
         inside = np.zeros(len(self.data), bool)
         inside[run] = True
         columns = station[0][:, :, :3] * inside[:, None, None]
@@ -474,7 +478,7 @@ class _Fine:
             return
         beyond = np.abs(solution.coefficients[random])
         std = np.sqrt(problem.model.variances(problem.robot)[random])
-        far = random[(beyond > 3.0 * std) & is_placement([names[i] for i in random])]
+        far = random[(beyond > 3.0 * std) & [not is_nuisance(names[i]) for i in random]]
         if not far.size:
             return
         ratio = np.abs(solution.coefficients[far]) / np.sqrt(problem.model.variances(problem.robot)[far])
@@ -512,7 +516,14 @@ class _Fine:
                 for answer in self._answers(self._solved(problem, doubt)):
                     answer = replace(answer, count=answer.count * len(doubts) * len(problems))
                     q = answer.question
-                    key = (q.code, q.target, q.joint, q.beside, q.code == "prior" and len(q.rows))
+                    key = (
+                        q.code,
+                        q.target,
+                        q.joint,
+                        q.beside,
+                        q.code == "prior" and len(q.rows),
+                        q.columns.shape[2],
+                    )
                     if answer.counted < SUSPICIOUS and (
                         key not in chosen or _order(answer) < _order(chosen[key][0])
                     ):
@@ -561,7 +572,7 @@ class _Fine:
             tried = count
             if question.code == "prior":  # chosen from so many parameters
                 tried += float(len(self.problem.robot.parameter_names)) ** len(question.rows)
-            if question.code == "block":  # chosen from so many runs
+            if question.code in ("block", "push"):  # chosen from so many runs
                 tried += n * n / 2.0
             yield _answer(solution, question, statistic, tried)
         some = (
@@ -654,7 +665,7 @@ class _Fine:
         words = length(size)
         if q.code in ("push", "drift"):
             turn = float(np.linalg.norm(amounts[3:]))
-            words = f"{words} and {milliradians(turn)}"
+            words = f"{words} and {milliradians(turn)}" if len(amounts) > 3 else words
         elif q.code == "joint_step":
             turns = bool(self.here.robot.joint_is_revolute[q.joint])
             size, unit = first * float(joint_units(self.here.robot)[q.joint]), "rad" if turns else "m"
