@@ -1,14 +1,16 @@
 """The error model on measured and on simulated robots: what is predicted and what is achieved.
 
-    python bench/error_model.py [--data ../shared/data] [--seeds 20] [--simulated 20] [--json FILE]
+    python bench/error_model.py [--data ../shared/data] [--seeds 20] [--simulated 20] [--kinds WORD …]
+                                [--json FILE]
 
 Measured robots, with ``full`` placement and base and tool unknown: ``irb120_tracker`` (36 × 3 points fitted; the
 40 rows of both test files predicted, the place of the re-seated target taken from the first row of each file),
 ``ur10_tracker`` (100 and 30 random rows of ``random_poses`` fitted, all others predicted; of ``joint_sweeps`` 100
-random rows, all others predicted). No test row is used for anything else. Simulated robots, one kind of error
-each: 40 × 2 points are fitted, 300 fresh configurations predicted. Shown are means over the seeds of: mean and
-rms distance [mm], predicted over achieved rms, left-out rms [mm], share of coordinates within 95 % intervals,
-seconds.
+random rows, all others predicted). No test row is used for anything else. Simulated robots are drawn from the
+error model, with one kind of error each: 40 × 2 points are fitted, 300 fresh configurations predicted. Shown are
+means over the seeds of: mean and rms distance [mm], predicted over achieved rms, left-out rms [mm], share of
+coordinates within 95 % intervals (of measured points, of true positions, of parameters), seconds, and how often a
+point lost its weight. With ``--kinds`` only simulated robots whose kind holds one of the words.
 """
 
 from __future__ import annotations
@@ -16,17 +18,18 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib_planner import Robot
-from calib_planner.error_model import ErrorModel, Knowledge, typical
+from calib_planner.error_model import ErrorModel, Knowledge, Truth, typical
 from calib_planner.identification import ModelEstimate, fit_error_model
 from calib_planner.io import read_measurements
 from calib_planner.measurements import Measurements
+from calib_planner.robot import Element
 from calib_planner.tracker import Isotropic, LaserTracker, Noise
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -107,6 +110,7 @@ def ur10(folder: Path, name: str, count: int, seeds: int) -> list[dict[str, Any]
 
 
 PLAIN = Isotropic(3e-5)
+FAR = LaserTracker(station=np.array([15.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True)
@@ -115,42 +119,46 @@ class Kind:
 
     Attributes:
         name: For the table.
-        scales: Scales of the error model that are not nothing.
+        scales: Scales of the error model that are not nothing; ``None``: all are drawn from their spread.
         heavy: Noise of the points is Student t with 3 degrees of freedom.
         backlash: Every joint stands half of this to one side or the other at a visit [rad].
         targets: How many.
         noise: The instrument; without it a point has 30 µm in each coordinate.
         stated: Whether the estimator is told the noise.
+        rail: Whether the robot stands on a rail of 2 m.
     """
 
     name: str
-    scales: tuple[tuple[str, float], ...] = ()
+    scales: tuple[tuple[str, float], ...] | None = ()
     heavy: bool = False
     backlash: float = 0.0
     targets: int = 2
     noise: Noise = PLAIN
     stated: bool = False
+    rail: bool = False
 
 
-FAR = LaserTracker(station=np.array([15.0, 0.0, 1.0]))
 VISITS = (("repeatability", 1e-4), ("shared", 5e-5))
 ALL = (("gravity", 2e-3), ("smooth.size", 3e-4), ("short.size", 2e-4), ("repeatability", 5e-5))
 KINDS = (
     Kind("noise only"),
+    Kind("noise only, stated", stated=True),
     Kind("gravity", (("gravity", 3e-3),)),
     Kind("smooth joints", (("smooth.size", 4e-4),)),
     Kind("short joints", (("short.size", 3e-4),)),
     Kind("visits", VISITS),
     Kind("visits, sigma stated", VISITS, stated=True),
-    Kind("all", ALL),
-    Kind("all, one target", ALL, targets=1),
-    Kind("gravity, six targets", (("gravity", 3e-3),), targets=6),
+    *(Kind(f"all, {n} targets", ALL, targets=n) for n in range(1, 7)),
+    Kind("all, on a rail", ALL, rail=True),
+    Kind("scales drawn", None),
     Kind("backlash", backlash=2e-4),
     Kind("tracker at 15 m, stated", noise=FAR, stated=True),
+    Kind("all, tracker at 15 m, stated", ALL, noise=FAR, stated=True),
     Kind("noise only, t3", heavy=True),
     Kind("gravity, t3", (("gravity", 3e-3),), heavy=True),
 )
 LIMITS = np.radians([[-170, 170], [-100, 60], [-100, 60], [-170, 170], [-100, 100], [-170, 170]])
+RAIL = [[0.0, 2.0]]
 TARGETS = [
     [0.0, 0.05, 0.1],
     [0.08, -0.03, 0.05],
@@ -159,38 +167,51 @@ TARGETS = [
     [-0.1, 0.0, 0.05],
     [0, -0.1, 0],
 ]
+PLACEMENT = {"placement.length": 3e-4, "placement.angle": 6e-4}
+LENGTHS = ("smooth.length", "short.length")
+
+
+def on_a_rail(robot: Robot) -> Robot:
+    """The robot on a rail along x of its base, behind the errors of the base and before its first joint."""
+    start = 1 + max(i for i, e in enumerate(robot.elements) if str(e.parameter).startswith("base."))
+    moved = [e if e.joint is None else replace(e, joint=e.joint + 1) for e in robot.elements]
+    return replace(
+        robot,
+        elements=(*moved[:start], Element("Tx", joint=0), *moved[start:]),
+        joint_names=("rail", *robot.joint_names),
+        joint_limits=np.concatenate([RAIL, robot.joint_limits]),
+    )
 
 
 def simulated(kind: Kind, seed: int, visits: int = 40, fresh: int = 300) -> dict[str, Any]:
     """A robot drawn from the error model, measured and predicted."""
     rng = np.random.default_rng(seed)
-    robot = Robot.load("ur10e").with_targets(TARGETS[: kind.targets]).with_parameters("full")
-    model = typical()
-    small = {s.name: 1e-12 for s in model.scales if s.name not in ("smooth.length", "short.length")}
-    truth = small | {"placement.length": 3e-4, "placement.angle": 6e-4} | dict(kind.scales)
-    true_model = model.with_values(truth)
-    beta = np.sqrt(true_model.variances(robot)) * rng.standard_normal(len(true_model.variances(robot)))
-    q = rng.uniform(LIMITS[:, 0], LIMITS[:, 1], (visits + fresh, 6))
-    known = Knowledge(robot, true_model, beta, np.zeros((len(beta),) * 2), np.zeros((len(beta), 0)))
-    poses, values = known.poses(q), true_model.values
-    joints = values["repeatability"] * rng.standard_normal(q.shape)
-    joints += 0.5 * kind.backlash * rng.choice([-1.0, 1.0], q.shape)
-    error = np.einsum("nij,nj->ni", poses.levers, joints)
-    error += np.tile(values["shared"] * rng.standard_normal((len(q), 3)), kind.targets)
-    shape = (len(q), kind.targets, 3)
-    draw = rng.standard_t(3, shape) / np.sqrt(3.0) if kind.heavy else rng.standard_normal(shape)
-    noise = (np.linalg.cholesky(kind.noise.covariance(poses.points)) @ draw[..., None])[..., 0]
-    data = Measurements(robot.joint_names, q, poses.points + error.reshape(shape) + noise)
+    arm = Robot.load("ur10e")
+    robot = (on_a_rail(arm) if kind.rail else arm).with_targets(TARGETS[: kind.targets]).with_parameters("full")
+    model = typical(kind.noise)
+    if kind.scales is None:
+        model = model.with_drawn_scales(rng)
+    else:
+        small = {s.name: 1e-12 for s in model.scales if s.name not in LENGTHS}
+        model = model.with_values(small | PLACEMENT | dict(kind.scales))
+    truth = Truth.draw(robot, model, rng)
+    limits = np.concatenate([RAIL, LIMITS]) if kind.rail else LIMITS
+    q = rng.uniform(limits[:, 0], limits[:, 1], (visits + fresh, len(limits)))
+    at_visits = truth.draw_visits(len(q), rng)
+    back = 0.5 * kind.backlash * rng.choice([-1.0, 1.0], q.shape)
+    points = truth.positions(q, replace(at_visits, joints=at_visits.joints + back))
+    standard = rng.standard_t(3, points.shape) / np.sqrt(3.0) if kind.heavy else rng.standard_normal(points.shape)
+    data = Measurements(robot.joint_names, q, points + truth.noise(points, standard))
     nominal = robot.with_parameters("full", ("base", "tool"))
     stated = typical(kind.noise if kind.stated else None)
     found, seconds = timed(nominal, data.select(np.arange(visits)), stated)
     row = judge(found.knowledge, data.select(np.arange(visits, len(q))), found, seconds)
     told = found.knowledge.predict(q[visits:])
     std = np.sqrt(np.diagonal(told.position, axis1=2, axis2=3))
-    row["positions"] = float(np.mean(np.abs(told.mean - poses.points[visits:]) <= INSIDE * std))
+    row["positions"] = float(np.mean(np.abs(told.mean - truth.positions(q[visits:])) <= INSIDE * std))
     at = [found.knowledge.robot.parameter_names.index(n) for n in robot.parameter_names]
     std = np.sqrt(np.diag(found.knowledge.covariance)[at])
-    apart = found.knowledge.coefficients[at] - beta[: len(at)]
+    apart = found.knowledge.coefficients[at] - truth.coefficients[: len(at)]
     row["parameters"] = float(np.mean(np.abs(apart) <= INSIDE * std))
     row["doubted"] = float((found.doubt > 0).any())
     return {"case": f"simulated: {kind.name}", "scales": found.knowledge.model.values, **row}
@@ -218,16 +239,18 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--simulated", type=int, default=20)
+    parser.add_argument("--kinds", nargs="+", default=[], metavar="WORD")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    if (args.data / "irb120_tracker").is_dir():
+    if (args.data / "irb120_tracker").is_dir() and not args.kinds:
         rows += irb120(args.data / "irb120_tracker")
         for name, count in (("random_poses", 100), ("random_poses", 30), ("joint_sweeps", 100)):
             rows += ur10(args.data / "ur10_tracker", name, count, args.seeds)
     for kind in KINDS:
-        rows += [simulated(kind, seed) for seed in range(args.simulated)]
-    rows.append(many())
+        if not args.kinds or any(word in kind.name for word in args.kinds):
+            rows += [simulated(kind, seed) for seed in range(args.simulated)]
+    rows += [] if args.kinds else [many()]
     show(rows)
     if args.json:
         args.json.write_text(json.dumps({"error_model": rows}, indent=1) + "\n", encoding="utf-8")

@@ -5,6 +5,8 @@ The oracle is the product of 4×4 matrices, element by element, not the code und
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import mixed, random_configurations
@@ -13,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from calib_planner import Robot
 from calib_planner.compensation import STATUS, Compensation, compensate
+from calib_planner.error_model import Gravity, JointFunctions, Knowledge, Mass, typical
 from calib_planner.errors import InputError
-from calib_planner.identification import JointCorrections
 from calib_planner.io import parse_urdf
 from calib_planner.robot.elements import rotation
 
@@ -297,20 +299,49 @@ def test_wrong_input_and_immutable_results() -> None:
             array[0] = 1.0
 
 
-def test_joints_that_turn_beyond_their_reading():
-    """Told the corrected readings, the real joints (reading + φ) put the tool where the nominal model says."""
+# ── gravity and joint functions ──────────────────────────────────────────────────────────────────────
+
+WAVES = 5
+
+
+def moments(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """(N, joints) moment of a unit mass at the tip about each joint: how its height falls, by differences."""
+    columns = []
+    for step in 1e-6 * np.eye(q.shape[1]):
+        columns.append((pose(robot, q - step) - pose(robot, q + step))[:, 2, 3] / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+def test_joints_that_turn_beyond_their_reading() -> None:
+    """Told the corrected readings q, the real joints, at q + φ(q) + δ(q), put the tool where the nominal is."""
     rng = np.random.default_rng(7)
     nominal = Robot.load("kuka_kr270")
-    calibrated = nominal.with_deviations({"d2": 1e-3, "q3": -2e-3})
-    waves = rng.normal(0.0, 3e-4, (2, 6, 5))
-    corrections = JointCorrections(nominal.joint_names, np.ones(6), np.zeros(6), *waves)
+    deviations = {"d2": 1e-3, "q3": -2e-3}
+    waves, give = rng.normal(0.0, 3e-4, (2, 6, WAVES)), rng.normal(0.0, 5e-4, 6)
+    model = replace(
+        typical(),
+        gravity=Gravity((Mass("tip"),)),
+        joint_functions=JointFunctions(("smooth",), WAVES),
+        scales=tuple(s for s in typical().scales if not s.name.startswith("short")),
+    )
+    robot = nominal.with_parameters(list(deviations))
+    beta = np.concatenate([[*deviations.values()], give, np.concatenate(waves, axis=1).ravel()])
+    nothing = np.zeros((len(beta), len(beta)))
+    known = Knowledge(robot, model, beta, nothing, nothing[:, :0])
     q = np.radians([0.0, -60.0, 90.0, 20.0, 45.0, 10.0]) + rng.normal(0.0, 0.2, (50, 6))
-    found = compensate(nominal, calibrated, q, corrections=corrections)
+    found = compensate(nominal, known.placed, q, corrections=known)
     assert set(found.status) == {"reached"}
-    x = found.corrected[..., None] * np.arange(1, 6)
-    actual = found.corrected + np.sum(waves[0] * np.cos(x) + waves[1] * np.sin(x), axis=2)
-    frames = [r.posture(a) for r, a in ((nominal, q), (calibrated, actual))]
-    np.testing.assert_allclose(frames[0].tip_origin, frames[1].tip_origin, atol=2e-9)
-    np.testing.assert_allclose(frames[0].tip_rotation, frames[1].tip_rotation, atol=2e-9)
-    np.testing.assert_allclose(corrections.reading(corrections.actual(q)), q, atol=1e-14)
-    assert found.position_error_before.mean() > 1e-4
+    true, told = nominal.with_deviations(deviations), found.corrected
+    errors = pose_errors(nominal, true, q, told + phi_of(waves, told) + give * moments(true, told))
+    assert errors.max() < 2e-9
+    assert (
+        pose_errors(nominal, true, q, told)[:, 0].min() > 1e-4
+    )  # what the joints do beyond their reading counts
+    before = pose_errors(nominal, true, q, q + phi_of(waves, q) + give * moments(true, q))
+    np.testing.assert_allclose(found.position_error_before, before[:, 0], rtol=0, atol=2e-9)
+
+
+def phi_of(waves: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(N, joints) Fourier series of each joint."""
+    x = q[..., None] * np.arange(1, WAVES + 1)
+    return np.asarray(np.sum(waves[0] * np.cos(x) + waves[1] * np.sin(x), axis=2))

@@ -84,16 +84,26 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         "robot": nominal.name,
         **result.to_dict(),
         "position_only": args.position_only,
-        "error_model": errors is not None,
+        "error_model": None if errors is None else {"terms": saved.document["error_model"]["terms"]},
         "output": args.output,
     }
     if args.json:
         terminal.answer(answer, lambda console: None)
     else:
         show_compensation(result, terminal.out if args.output else terminal.err)
+    if saved.learnt is None and not args.geometry_only:
+        terminal.note(f"{args.estimate}: {_without_model(saved.document)}")
     for status, count in Counter(result.status).items():
         if status != "reached":
             terminal.note(f"{count} of {len(result.status)} targets {status}: {STATUS[status]}")
+
+
+def _without_model(document: dict[str, Any]) -> str:
+    """What an estimate of an older version, a ``document``, cannot give."""
+    text = "it holds no error model, so placement alone is corrected, without gravity and joint functions"
+    if document.get("joint_corrections") is not None:
+        text += "; its joint corrections are of an older version and are not applied"
+    return f"{text}: identify again for the whole correction"
 
 
 def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:

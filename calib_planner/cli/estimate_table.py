@@ -13,7 +13,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from calib_planner.identification import Estimate, LeftOutError, Reason, Validation
+from calib_planner.error_model import MEANINGS
+from calib_planner.identification import NOISE_SOURCES, Estimate, LeftOutError, Reason, Validation
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import is_nuisance
 from calib_planner.units import counted, length, milli, signed
@@ -25,24 +26,7 @@ WORDS = {
     "WARN": "WARN: usable, but look at the reasons",
     "FAIL": "FAIL: do not rely on this calibration",
 }
-SOURCES = {
-    "sigma": "as given",
-    "instrument": "by the instrument",
-    "data": "by the files' std",
-    "residuals": "from the residuals",
-}
-MEANINGS = {
-    "placement": "lengths, axes and zeros of the chain, base and targets: what a URDF can hold",
-    "gravity": "joints that give way under the weight of the arm",
-    "smooth": "gears and encoders: errors of a few waves a turn of a joint",
-    "short": "gears and encoders: errors that change within some degrees of a joint",
-    "visits": "repeatability of the robot, new each time that it comes to a configuration",
-    "points": "noise of the instrument and of each point",
-}
-"""Term of the error model → what it means."""
 HEADINGS = ("count", "mean before", "mean after", "median", "rms", "max", "rms predicted", "in 95 %")
-MOST_REASONS = 3
-"""A first screen that people read."""
 MOST_POINTS = 10
 MOST_COMBINATIONS = 8
 MOST_POSES = 6
@@ -74,22 +58,21 @@ def show_estimate(estimate: Estimate, console: Console, where: Callable[[int], s
 
 
 def _show_verdict(estimate: Estimate, console: Console) -> None:
-    """The level and its ``MOST_REASONS`` most important reasons; the rest stands at the end."""
+    """The level and its foremost reasons; the rest stands at the end."""
     verdict = estimate.verdict
     console.print(WORDS[verdict.level], style=STYLES[verdict.level])
-    for reason in verdict.reasons[:MOST_REASONS]:
+    for reason in verdict.foremost:
         console.print(Padding(_reason(reason), (0, 0, 0, 2)))
-    more = len(verdict.reasons) - MOST_REASONS
-    if more > 0:
-        console.print(Padding(Text(f"{counted(more, 'more remark')} at the end", style="dim"), (0, 0, 0, 2)))
+    if verdict.further:
+        more = f"{counted(len(verdict.further), 'more remark')} at the end"
+        console.print(Padding(Text(more, style="dim"), (0, 0, 0, 2)))
 
 
 def _show_remarks(estimate: Estimate, console: Console) -> None:
     """The reasons that the first screen does not show."""
-    more = estimate.verdict.reasons[MOST_REASONS:]
-    if more:
+    if estimate.verdict.further:
         console.print("Further remarks:")
-    for reason in more:
+    for reason in estimate.verdict.further:
         console.print(Padding(_reason(reason), (0, 0, 0, 2)))
 
 
@@ -111,8 +94,12 @@ def _distances(estimate: Estimate) -> Table:
     before, after = estimate.residuals.before, estimate.residuals.after
     cells = [milli(before.mean), milli(after.mean), "", milli(after.rms), milli(after.max)]
     table.add_row("fitted", str(estimate.points.used), *cells)
-    _add_left_out(table, "left out, visit by visit", estimate.left_out)
     systematic = len(estimate.knowledge.model.systematic) > 1
+    if systematic:
+        alone = estimate.residuals.placement_alone
+        cells = ["", milli(alone.mean), "", milli(alone.rms), milli(alone.max)]
+        table.add_row("… placement alone", "", *cells)
+    _add_left_out(table, "left out, visit by visit", estimate.left_out)
     if systematic:
         _add_left_out(table, "… placement alone", estimate.placement_alone)
     if estimate.validation is not None:
@@ -151,7 +138,8 @@ def _terms(estimate: Estimate) -> Table:
 
 def _noise(estimate: Estimate) -> str:
     """Noise of a point, in one line."""
-    return f"Noise per coordinate of a point: {length(estimate.noise.sigma)} ({SOURCES[estimate.noise.source]})."
+    noise = estimate.noise
+    return f"Noise per coordinate of a point: {length(noise.sigma)} ({NOISE_SOURCES[noise.source]})."
 
 
 def _accuracy(estimate: Estimate) -> str:
@@ -194,8 +182,8 @@ def _parameters(estimate: Estimate) -> Table:
         table.add_row(
             name,
             label,
-            f"{nominal:.4f}",
-            f"{value:.4f}",
+            signed(nominal, 4),
+            signed(value, 4),
             *change,
             remarks.get(name, ""),
             style="dim" if fixed else "",
@@ -229,7 +217,7 @@ def _show_points(
     """Points with reasons, farthest first."""
     if not points:
         return
-    console.print(f"{title}: {len(points)} points, farthest first (rows count from 0)")
+    console.print(f"{title}: {counted(len(points), 'point')}, farthest first (rows count from 0)")
     for point in sorted(points, key=lambda p: -p.normalised_residual)[:MOST_POINTS]:
         place = f" ({where(point.row)})" if where else ""
         console.print(f"  row {point.row}, target {point.target}{place}: {point.reason}", soft_wrap=True)

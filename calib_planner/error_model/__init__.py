@@ -14,10 +14,10 @@ from calib_planner.error_model.knowledge import (
     error_variance,
     without_rigid_motion,
 )
-from calib_planner.error_model.model import ErrorModel, Scale
-from calib_planner.error_model.placement import Placement
+from calib_planner.error_model.model import MEANINGS, ErrorModel, Scale
+from calib_planner.error_model.placement import ZERO, Placement
 from calib_planner.error_model.points import Points
-from calib_planner.error_model.poses import Poses
+from calib_planner.error_model.poses import Poses, joint_units
 from calib_planner.error_model.prior import Prior
 from calib_planner.error_model.saved import from_mapping, to_mapping
 from calib_planner.error_model.truth import Truth, VisitErrors

@@ -47,7 +47,10 @@ class JointFunctions:
     harmonics: int = 0
 
     name: ClassVar[str] = "joint_functions"
-    title: ClassVar[str] = "errors of the joints' gears and encoders"
+    titles: ClassVar[dict[str, str]] = {
+        "smooth": "gears and encoders: errors of a few waves a turn of a joint",
+        "short": "gears and encoders: errors that change within some degrees of a joint",
+    }
 
     def __post_init__(self) -> None:
         for component in self.components:

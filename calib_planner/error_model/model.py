@@ -37,6 +37,16 @@ NOTHING_KNOWN = 1e300
 """Factor of a scale of which nothing is known."""
 
 
+MEANINGS = {
+    Placement.name: Placement.title,
+    Gravity.name: Gravity.title,
+    **JointFunctions.titles,
+    Visits.name: Visits.title,
+    Points.name: Points.title,
+}
+"""Term, or component of the joint functions → what it means."""
+
+
 @dataclass(frozen=True)
 class Scale:
     """A size in the error model.

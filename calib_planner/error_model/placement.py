@@ -43,7 +43,7 @@ class Placement:
     stated: Prior | None = None
 
     name: ClassVar[str] = "placement"
-    title: ClassVar[str] = "lengths, axes and zeros of the chain"
+    title: ClassVar[str] = "lengths, axes and zeros of the chain, base and targets: what a URDF can hold"
 
     def __post_init__(self) -> None:
         if self.prior not in PRIORS:

@@ -36,7 +36,7 @@ class Points:
     floor: bool = True
 
     name: ClassVar[str] = "points"
-    title: ClassVar[str] = "noise of the instrument and of the point"
+    title: ClassVar[str] = "noise of the instrument and of each point"
 
     @property
     def scales(self) -> tuple[str, ...]:

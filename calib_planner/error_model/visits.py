@@ -36,7 +36,7 @@ class Visits:
     shared: bool = True
 
     name: ClassVar[str] = "visits"
-    title: ClassVar[str] = "repeatability, and what the targets of a visit share"
+    title: ClassVar[str] = "repeatability: new each time that the robot comes to a configuration"
 
     @property
     def scales(self) -> tuple[str, ...]:

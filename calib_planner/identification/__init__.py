@@ -4,7 +4,9 @@ docs/glossary.md explains the words.
 """
 
 from calib_planner.identification.estimate import (
+    FOREMOST,
     LEVELS,
+    NOISE_SOURCES,
     STATUS,
     STRONG,
     Accuracy,

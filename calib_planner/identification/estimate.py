@@ -35,6 +35,8 @@ STATUS = {
 """Every status an estimate can have, with advice."""
 LEVELS = ("PASS", "WARN", "FAIL")
 """Levels of a verdict and of its reasons, the best first."""
+FOREMOST = 3
+"""Reasons of a verdict that people read at once."""
 STRONG = 0.95
 """Correlations beyond this are named."""
 CHANCE = 0.01
@@ -178,11 +180,12 @@ class Residuals:
     """Measured − predicted points.
 
     Attributes:
-        vectors: (N, targets, 3) with the identified parameters [m], NaN where not measured.
+        vectors: (N, targets, 3) with all that was identified [m], NaN where not measured.
         normalised: (N, targets) their lengths in standard deviations of what they should be.
         gate: Largest believable normalised residual.
         before: Of the points used, with nominal kinematics (base and targets fitted where they are unknown).
-        after: Of the points used, with the identified parameters.
+        after: Of the points used, with all that was identified.
+        placement_alone: Of the points used, from where ``Estimate.calibrated`` has them.
         sigma: Scatter of one coordinate about the fit [m], NaN without redundancy.
         chi_square: Whether measurement noise alone explains them.
     """
@@ -192,11 +195,21 @@ class Residuals:
     gate: float
     before: ResidualStatistics
     after: ResidualStatistics
+    placement_alone: ResidualStatistics
     sigma: float
     chi_square: ChiSquare
 
     def __post_init__(self) -> None:
         _freeze(self, "vectors", "normalised")
+
+
+NOISE_SOURCES = {
+    "sigma": "as given",
+    "instrument": "by the instrument's description",
+    "data": "by the standard deviations in the data",
+    "residuals": "from the residuals",
+}
+"""Who says how large the noise of a point is, in words."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +218,7 @@ class PointNoise:
 
     Attributes:
         sigma: Standard deviation of one coordinate, root mean square over the points used [m].
-        source: Who says so: ``sigma``, ``instrument``, ``data`` or ``residuals``.
+        source: Who says so, a key of ``NOISE_SOURCES``.
     """
 
     sigma: float
@@ -368,6 +381,16 @@ class Verdict:
     level: str
     reasons: tuple[Reason, ...]
 
+    @property
+    def foremost(self) -> tuple[Reason, ...]:
+        """The reasons for a first screen; ``further`` has the rest."""
+        return self.reasons[:FOREMOST]
+
+    @property
+    def further(self) -> tuple[Reason, ...]:
+        """The reasons behind the ``foremost``."""
+        return self.reasons[FOREMOST:]
+
     @staticmethod
     def of(reasons: list[Reason]) -> Verdict:
         """The verdict that follows from ``reasons``; reasons of one level keep their order."""
@@ -458,6 +481,7 @@ class Estimate:
             "left_out": asdict(self.left_out),
             "placement_alone": {
                 "parameters": dict(zip(fit.parameters, self.placement_values, strict=True)),
+                "residual_after": vars(residuals.placement_alone),
                 "left_out": asdict(self.placement_alone),
             },
             "error_model": {

@@ -24,6 +24,9 @@ from calib_planner.errors import NotEnoughDataError
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 
+THIN = 1e-2
+"""Points thinner than this share of their extent keep to a plane: what is across it is noise and tolerances."""
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -131,7 +134,7 @@ def _base_rotation(
     offsets: FloatArray | None,
     root: FloatArray,
 ) -> FloatArray:
-    n = len(p)
+    n, p = len(p), _without_thickness(p, root)
     blocks = np.zeros((n, 3, 3, 3))
     for axis in range(3):
         blocks[:, axis, axis, :] = p
@@ -156,6 +159,16 @@ def _base_rotation(
         )
     sign = np.sign(np.linalg.det(u @ vt))
     return (u @ np.diag([1.0, 1.0, sign]) @ vt).T
+
+
+def _without_thickness(p: FloatArray, root: FloatArray) -> FloatArray:
+    """Points (n, 3) about their centre, weighted by ``root``²; without their distance from a plane they keep to.
+
+    d takes up the centre. Noise across the plane of a robot that moves in one would tell a column of C.
+    """
+    p = p - np.average(p, axis=0, weights=root**2)
+    squares, axes = np.linalg.eigh(p.T @ (p * root[:, None] ** 2))
+    return p - np.outer(p @ axes[:, 0], axes[:, 0]) if squares[0] < THIN**2 * squares[2] else p
 
 
 def _solve(system: FloatArray, right: FloatArray) -> FloatArray:

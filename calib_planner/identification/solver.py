@@ -299,6 +299,9 @@ def _estimate(
             gate=gate,
             before=residual_statistics(np.linalg.norm(before, axis=2)[use]),
             after=residual_statistics(np.linalg.norm(residuals, axis=2)[use]),
+            placement_alone=residual_statistics(
+                np.linalg.norm(data.p - calibrated.positions(data.q), axis=2)[use]
+            ),
             sigma=scatter,
             chi_square=ChiSquare(chi, int(linear.seen.sum()) - flat),
         ),

@@ -49,6 +49,6 @@ def _saved(path: str | Path) -> Node:
         return read_document(path, KIND)["error_model"]
     part = read_document(path, "estimate").get("error_model")
     if part.value is None:
-        advice = "give an estimate that identify --error-model wrote"
+        advice = "it is of an older version: identify again"
         raise part.error("nothing", "the error model of the estimate", advice)
     return part["model"]

@@ -178,8 +178,8 @@ def _made(node: Node, kind: type[T], more: tuple[str, ...] = ()) -> T | None:
 
 
 def _noise(node: Node) -> PointNoise | None:
-    """Noise of a point; what older files say beside it is left aside."""
-    if node.value is None:
+    """Noise of a point; older files split it in another way, which is left aside."""
+    if node.value is None or "measurement" in node:
         return None
     node.mapping(None, ("sigma", "source"))
     return PointNoise(_float(node["sigma"]), node["source"].of_kind("str"))
@@ -274,7 +274,7 @@ class SavedEstimate:
         status: A key of ``identification.estimate.STATUS``.
         base: (9,) the base's pose, see ``BASE`` [m, rad]; ``None`` if the file does not say.
         targets: (targets, 3) in the tip's frame [m]; ``None`` if the file does not say.
-        noise: Of a point, or ``None``.
+        noise: Of a point; ``None`` in older files.
         chi_square: Whether measurement noise alone explains the residuals, or ``None``.
         verdict: Whether the calibration is good, or ``None``.
         predicted_accuracy_per_test_pose: (K,) [m]; infinite where it rests on what the data cannot see.

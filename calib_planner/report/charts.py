@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import Poses
-from calib_planner.identification import Estimate, Validation
+from calib_planner.identification import Estimate
 from calib_planner.report.calibration import CalibrationReport
 from calib_planner.report.render import Drawing, Shape, shape
 from calib_planner.report.scene import REJECTED, SUSPECT, USED, point_states, thinned
@@ -183,13 +183,51 @@ class Row(NamedTuple):
     ticks: tuple[float, ...] = ()
 
 
+class ComparedSet(NamedTuple):
+    """Points whose distances are compared: name for people, then places in the report's JSON, empty: it has none.
+
+    ``number`` is their number; ``key`` has mean, rms, max and, if ``predicted``, predicted_rms; ``alone`` the same of placement alone.
+    """
+
+    name: str
+    key: str
+    number: str
+    before: str
+    alone: str
+    predicted: bool
+    inside: str
+
+
+def compared_sets(estimate: Estimate) -> list[ComparedSet]:
+    """The points of the fit, those left out visit by visit, and those held out, as far as there are any."""
+    fit, left, tested = "estimate.residual_after", "estimate.left_out", "estimate.validation"
+    alone, before = "estimate.placement_alone.", "estimate.residual_before.mean"
+    sets = [ComparedSet("points of the fit", fit, "estimate.used", before, f"{alone}residual_after.", False, "")]
+    if estimate.left_out.count:
+        sets.append(
+            ComparedSet("left out, visit by visit", left, f"{left}.count", "", f"{alone}left_out.", True, "")
+        )
+    if estimate.validation is not None:
+        inside = f"{tested}.within_95"
+        own = (f"{tested}.count", f"{tested}.before_mean", f"{tested}.placement_")
+        sets.append(ComparedSet("held-out points", tested, *own, True, inside))
+    return sets
+
+
 def accuracy_charts(estimate: Estimate) -> tuple[Drawing, Drawing | None]:
     """Mean distances before and after; and what was predicted beside what was achieved, if anything was."""
     required = estimate.accuracy.required if np.isfinite(estimate.accuracy.required) else None
-    sets = validation_sets(estimate)
+    left, test = estimate.left_out, estimate.validation
     means = [Row("points of the fit", estimate.residuals.before.mean, estimate.residuals.after.mean)]
-    means += [Row(name, v.before_mean, v.mean) for name, _, v in sets]
-    promised = [Row(f"{name}: {length(v.rms)}", None, v.rms, (v.predicted_rms,)) for name, _, v in sets]
+    promised = []
+    if left.count:
+        means.append(Row("left out, visit by visit", None, left.mean))
+        promised.append(
+            Row(f"left out, visit by visit: {length(left.rms)}", None, left.rms, (left.predicted_rms,))
+        )
+    if test is not None:
+        means.append(Row("held-out points", test.before_mean, test.mean))
+        promised.append(Row(f"held-out points: {length(test.rms)}", None, test.rms, (test.predicted_rms,)))
     per = estimate.accuracy.predicted
     finite = per[np.isfinite(per)]
     if finite.size:
@@ -197,12 +235,6 @@ def accuracy_charts(estimate: Estimate) -> tuple[Drawing, Drawing | None]:
         promised.append(Row(f"{what}: not measured, prediction only", None, None, tuple(finite.tolist())))
     first = _compared(means, "mean distance before and after calibration")
     return first, _compared(promised, "achieved and predicted error", required) if promised else None
-
-
-def validation_sets(estimate: Estimate) -> list[tuple[str, str, Validation]]:
-    """Name, attribute of the estimate and statistics of each validation there is."""
-    held_out = estimate.validation
-    return [("held-out points", "validation", held_out)] if held_out else []
 
 
 def _compared(rows: list[Row], title: str, required: float | None = None) -> Drawing:
@@ -372,21 +404,38 @@ def joint_residuals(report: CalibrationReport) -> FloatArray:
     return parts
 
 
-def joint_function_charts(report: CalibrationReport) -> list[Drawing]:
-    """What each joint turns beyond its reading by its own angle, if joint functions are in the model."""
-    e, q = report.estimate, report.problem.data.q
-    model = e.knowledge.model
-    if model.joint_functions is None:
-        return []
+def deflection_marks(estimate: Estimate) -> list[tuple[str, str]]:
+    """Class and words of what ``deflection_charts`` draws."""
+    model = estimate.knowledge.model
+    own, sag = ("mean along", "by its own angle: gears and encoder"), ("dots axial", "by gravity, where measured")
+    return [own] * (model.joint_functions is not None) + [sag] * (model.gravity is not None)
+
+
+def deflection_charts(report: CalibrationReport) -> list[Drawing]:
+    """What each joint turns beyond its reading by its angle: joint functions as lines, gravity as dots."""
+    known, data = report.estimate.knowledge, report.problem.data
+    q, loads = data.q, known.model.payloads(data.payload, len(data))
+    model, place = known.model, known.model.slices(known.robot)
     grid = np.linspace(q.min(axis=0), q.max(axis=0), 121)
-    place = model.slices(e.knowledge.robot)[model.joint_functions.name]
-    readings = Poses(e.knowledge.placed, grid)
-    phi = 1e3 * model.joint_functions.deflection(readings, e.knowledge.coefficients[place])
-    highest = 1.1 * float(np.abs(phi).max()) or 1.0
+    chosen = thinned(np.zeros(len(q)), MOST_DOTS // 4)
+    own, sag = np.zeros_like(grid), np.zeros_like(q[chosen])
+    if model.joint_functions is not None:
+        coefficients = known.coefficients[place[model.joint_functions.name]]
+        own = 1e3 * model.joint_functions.deflection(Poses(known.placed, grid), coefficients)
+    if model.gravity is not None:
+        standing = Poses(known.placed, q[chosen], None if loads is None else loads[chosen])
+        sag = 1e3 * model.gravity.deflection(standing, known.coefficients[place["gravity"]])
+    highest = 1.1 * float(max(np.abs(own).max(), np.abs(sag).max())) or 1.0
     charts = []
-    for k, turns in enumerate(e.calibrated.joint_is_revolute):
-        chart, shown = _by_joint(e, k, grid, 160, "mrad" if turns else "mm", highest, "joint function of")
-        charts.append(chart.drawing(chart.line("mean along", shown, phi[:, k])))
+    for k, turns in enumerate(report.estimate.calibrated.joint_is_revolute):
+        unit = "mrad" if turns else "mm"
+        chart, at = _by_joint(report.estimate, k, grid, 160, unit, highest, "what turns beyond its reading,")
+        marks = []
+        if model.gravity is not None:
+            marks.append(chart.dots("axial small", joint_factor(bool(turns)) * q[chosen, k], sag[:, k]))
+        if model.joint_functions is not None:
+            marks.append(chart.line("mean along", at, own[:, k]))
+        charts.append(chart.drawing(*marks))
     return charts
 
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from calib_planner.identification import STRONG, Estimate, IdentificationProblem
+from calib_planner.error_model import MEANINGS
+from calib_planner.identification import FOREMOST, NOISE_SOURCES, STRONG, Estimate, IdentificationProblem
 from calib_planner.io import URDF_SUFFIXES, write_text
 from calib_planner.report import charts
 from calib_planner.report.calibration import CalibrationReport, Provenance, calibration_report
@@ -29,6 +30,8 @@ HEADLINES = {
     "FAIL": ("✗", "Do not apply it as it stands"),
 }
 """Mark and words of each level."""
+FRAMES = {"world": " in the frame of the points", "robot": " up to a new registration of the robot"}
+"""Frame of the accuracy at the test poses → the words behind it."""
 MOST_PAIRS = 40
 """Correlated pairs that are listed by name."""
 
@@ -68,7 +71,12 @@ def report_page(report: CalibrationReport) -> str:
         rounded=rounded,
         mark=mark,
         advice=advice,
-        sets=[(name, f"estimate.{key}") for name, key, _ in charts.validation_sets(report.estimate)],
+        sets=charts.compared_sets(report.estimate),
+        frame=FRAMES[data["estimate"]["accuracy_frame"]],
+        source=NOISE_SOURCES[report.estimate.noise.source],
+        meanings=MEANINGS,
+        deflection_marks=charts.deflection_marks(report.estimate),
+        papers=report.estimate.knowledge.model.is_papers,
         parameters=_parameters(report.estimate),
         placed=any(map(is_nuisance, report.estimate.fit.parameters)),
         ways=ways_to_apply(report),
@@ -82,6 +90,7 @@ def report_page(report: CalibrationReport) -> str:
         systematic=len(report.estimate.knowledge.model.systematic) > 1,
         shown_unit=MILLI_UNIT,
         most_pairs=MOST_PAIRS,
+        most_reasons=FOREMOST,
         strong=STRONG,
         embedded=embedded,
         json_text=_json(data),
@@ -109,6 +118,8 @@ def rounded(value: float, style: str) -> str:
         return signed(1e3 * value, 4)
     if style == "change":
         return signed(1e3 * value, 4, plus=True)
+    if style == "gain":
+        return signed(value, 1, plus=True)
     if style == "percent":
         return f"{100 * value:.0f} %"
     if style == "correlation":
@@ -150,7 +161,7 @@ def ways_to_apply(report: CalibrationReport) -> list[tuple[str, str, str]]:
     made = report.provenance
     robot = made.named("robot") or report.problem.robot.source or report.problem.robot.name
     learnt = len(report.estimate.knowledge.model.systematic) > 1
-    without = " The joint corrections are not in it." if learnt else ""
+    without = " It holds placement alone: gravity and joint functions are not in it." if learnt else ""
     if "identify" in made.command:
         again = made.command
     else:
@@ -167,7 +178,8 @@ def ways_to_apply(report: CalibrationReport) -> list[tuple[str, str, str]]:
     command = f"{again} --kinematics-output my_kinematics.yaml"
     ways.append(("Kinematics from xyz + rpy per joint", text + without, command))
     text = "Joint targets corrected one by one, so that the real tool goes where the nominal model says."
-    text += " With the joint corrections: this alone reaches the accuracy above." if learnt else ""
+    if learnt:
+        text += " With gravity and joint functions: this alone reaches the accuracy of the whole error model."
     command = (
         f"calib-planner compensate --robot {quote(robot)} --estimate {quote(made.estimate or 'estimate.yaml')} "
         "--targets path.csv --output corrected.csv"

@@ -76,7 +76,8 @@ class Scene:
 
 def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatArray) -> Scene:
     """The scene; ``before`` (N, targets, 3) measured − predicted with the nominal kinematics [m]."""
-    data, robot = problem.data, estimate.calibrated
+    data, known = problem.data, estimate.knowledge
+    robot = known.placed
     turn, place = robot.base_pose
     where = np.argwhere(data.seen)
     seen = tuple(where.T)
@@ -96,8 +97,8 @@ def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatAr
         before=before[seen] @ turn,
         states=states,
         robot_rows=rows,
-        robots=bodies(robot, data.q[rows]),
-        test_robots=bodies(robot, estimate.accuracy.test_poses.reshape(-1, len(robot.joint_names))),
+        robots=bodies(robot, known.actual(data.q, data.payload)[rows]),
+        test_robots=bodies(robot, known.actual(estimate.accuracy.test_poses.reshape(-1, len(robot.joint_names)))),
         target_count=len(robot.targets),
         tracker=_tracker(problem, turn, place),
     )

@@ -8,12 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from robots import MIXED_URDF
+from robots import MIXED_URDF, random_configurations
 
 from calib_planner import Robot
 from calib_planner.cli import main
-from calib_planner.io import calibrated_robot, read_configurations, read_estimate
+from calib_planner.error_model import typical
+from calib_planner.io import (
+    calibrated_robot,
+    read_configurations,
+    read_estimate,
+    write_configurations,
+    write_measurements,
+)
 from calib_planner.io.yaml import write_document
+from calib_planner.simulation import SimulatedCell, random_deviations
 
 OFFSETS = {"turn.offset": 1e-3, "slide.offset": -2e-3, "spin.offset": 5e-3, "nod.offset": -4e-3}
 Q = [[0.1, 0.2, 0.3, 0.4], [-0.5, 0.0, 2.0, -0.6]]
@@ -136,6 +144,61 @@ def test_estimates_of_other_robots(
     saved = estimate(tmp_path / "e.yaml", other, {"turn.x": 1e-3})
     assert main(words(cell | {"--estimate": saved})) == 2
     assert "turn.x: expected 0.1, the robot's, got nominal 0.11" in capsys.readouterr().err
+
+
+def test_an_older_estimate_without_an_error_model_is_said(
+    cell: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Placement alone is corrected all the same; nobody who asked for just that is told."""
+    robot = Robot.load(cell["--robot"])
+    older = {
+        "noise": {"measurement": 1e-5, "source": "sigma", "discrepancy": 0.0},
+        "joint_corrections": {"size": 1e-3},
+    }
+    for changes, word in (
+        ({}, "placement alone is corrected"),
+        (older, "joint corrections are of an older version"),
+    ):
+        saved = estimate(tmp_path / "e.yaml", robot, OFFSETS, **changes)
+        assert main(words(cell | {"--estimate": saved}, "--json")) == 0
+        out, err = capsys.readouterr()
+        assert f"{saved}: it holds no error model" in err and word in err and "identify again" in err
+        result = json.loads(out)
+        assert result["error_model"] is None and result["reached"] == 2
+        np.testing.assert_allclose(result["corrected"], np.array(Q) - list(OFFSETS.values()), rtol=0, atol=1e-9)
+        assert main(words(cell | {"--estimate": saved}, "--geometry-only")) == 0
+        assert "no error model" not in capsys.readouterr().err
+
+
+def test_the_true_robot_is_the_judge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A robot with gravity and joint functions is identified: corrected targets bring it where it should be.
+
+    Its points are in the frame of its own base, so that nothing but the robot is between the two.
+    """
+    nominal = Robot.load("kuka_kr270")
+    model = typical().with_values({"gravity": 1e-3, "smooth.size": 3e-4})
+    truth = SimulatedCell(nominal, random_deviations(nominal, 1), 1e-5, error_model=model, seed=2)
+    data, saved, targets = (str(tmp_path / n) for n in ("p.csv", "e.yaml", "q.csv"))
+    write_measurements(data, truth.measure(random_configurations(nominal, 80, 3), 1, 4))
+    assert main(["identify", "--robot", "kuka_kr270", "--data", data, "--output", saved]) == 0
+    q = random_configurations(nominal, 60, 5) / 2.0
+    write_configurations(targets, nominal.joint_names, q)
+    cell = {"--robot": "kuka_kr270", "--estimate": saved, "--targets": targets}
+    wanted, off = nominal.positions(q), {}
+    for name, more in (("all", ()), ("placement", ("--geometry-only",))):
+        capsys.readouterr()
+        assert main(words(cell, "--position-only", "--tool", "0 0 0", "--json", *more)) == 0
+        result = json.loads(capsys.readouterr().out)
+        reached = truth.truth.positions(result["corrected"])
+        off[name] = float(np.sqrt(np.mean(np.sum((reached - wanted) ** 2, axis=2))))
+        terms = result["error_model"]
+        assert (
+            terms is None
+            if more
+            else [t["name"] for t in terms["terms"] if t["kept"]][:2] == ["placement", "gravity"]
+        )
+    before = float(np.sqrt(np.mean(np.sum((truth.truth.positions(q) - wanted) ** 2, axis=2))))
+    assert before > 1e-3 and off["placement"] < 0.5 * before and off["all"] < 0.5 * off["placement"]
 
 
 def test_a_saved_estimate_as_a_robot(cell: dict[str, str]) -> None:

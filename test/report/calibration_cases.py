@@ -11,7 +11,6 @@ from robots import mixed, random_configurations
 from scipy.spatial.transform import Rotation
 
 from calib_planner import Estimate, IdentificationProblem, Measurements, Robot, identify, validate
-from calib_planner.identification import cross_validate
 from calib_planner.report import Provenance
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -47,8 +46,7 @@ def kuka(
 
 def clean() -> Case:
     problem, estimate = kuka(16, repetitions=2, required_accuracy=2e-4)
-    held_out = kuka(5)[0].data
-    return problem, cross_validate(problem, validate(problem, estimate, [held_out]), 4)
+    return problem, validate(problem, estimate, [kuka(5)[0].data])
 
 
 def outliers() -> Case:

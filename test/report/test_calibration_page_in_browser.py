@@ -272,7 +272,7 @@ def test_without_javascript_there_is_a_drawing(chromium: Browser, page: Path) ->
 
 
 def test_three_thousand_points_are_drawn(chromium: Browser, tmp_path: Path) -> None:
-    write_report(tmp_path / "report.html", *kuka(3000, starts=0))
+    write_report(tmp_path / "report.html", *kuka(3000))
     tab = chromium.open(tmp_path / "report.html")
     assert tab.run(HELP + "return [canvas.dataset.points, canvas.dataset.arrows];") == ["3000", "400"]
     assert tab.problems == []

@@ -16,6 +16,7 @@ from calibration_cases import BASE, CASES, Case, clean, hostile, kuka, outliers
 from robots import SHARED_DATA, random_configurations
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
+from calib_planner.error_model import MEANINGS, ErrorModel
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io import read_measurements
 from calib_planner.report import provenance, write_report
@@ -118,9 +119,22 @@ def test_the_most_important_numbers_are_there(case: Case) -> None:
         if name not in estimate.observability.fixed and np.isfinite(estimate.fit.std[i]):
             wanted |= {f"estimate.parameters.{i}.{k}" for k in ("nominal", "value", "deviation", "std")}
     wanted |= {f"estimate.rejected.{i}.residual" for i in range(len(estimate.points.rejected))}
-    for name in ("validation", "cross_validation"):
-        if getattr(estimate, name) is not None:
-            wanted |= {f"estimate.{name}.{k}" for k in ("before_mean", "mean", "rms", "max", "predicted_rms")}
+    sets = {"left_out": ("count", "mean", "rms", "max", "predicted_rms")} if estimate.left_out.count else {}
+    if estimate.validation is not None:
+        sets["validation"] = ("before_mean", "mean", "rms", "max", "predicted_rms", "within_95")
+    wanted |= {f"estimate.{name}.{k}" for name, keys in sets.items() for k in keys}
+    if len(estimate.knowledge.model.systematic) > 1:
+        alone = [
+            "placement_alone.residual_after.",
+            *(["placement_alone.left_out."] if "left_out" in sets else []),
+        ]
+        alone += ["validation.placement_"] if "validation" in sets else []
+        wanted |= {f"estimate.{name}{k}" for name in alone for k in ("mean", "rms")}
+    wanted |= {f"estimate.error_model.terms.{i}.size" for i, t in enumerate(estimate.terms) if t.kept}
+    kinds = ("predicted", "parameter") if np.isfinite(estimate.accuracy.predicted).all() else ()
+    wanted |= {
+        f"estimate.{k}_accuracy_per_test_pose.{i}" for k in kinds for i in range(len(estimate.accuracy.predicted))
+    }
     assert wanted <= keys
     if estimate.accuracy.required > 0:
         assert "required_accuracy" in keys
@@ -137,7 +151,7 @@ def test_distances_before_are_those_of_the_estimate(case: Case) -> None:
     np.testing.assert_allclose(before.max(), estimate.residuals.before.max, rtol=1e-6)
 
 
-def test_the_verdict_comes_first_with_every_reason(case: Case) -> None:
+def test_the_verdict_comes_first_with_every_reason_the_first_three_at_once(case: Case) -> None:
     problem, estimate = case
     text = report_page(calibration_report(problem, estimate))
     page = Page(text)
@@ -146,6 +160,10 @@ def test_the_verdict_comes_first_with_every_reason(case: Case) -> None:
     said = " ".join(page.text["verdict"].split()).lower()
     for reason in estimate.verdict.reasons:
         assert reason.text.lower() in said and reason.advice.lower() in said
+    reasons = len(estimate.verdict.reasons)
+    assert text.count('<span class="said">') == reasons and len(estimate.verdict.foremost) == min(reasons, 3)
+    shown = text[: text.index("<details>")] if reasons > 3 else text
+    assert shown.count('<span class="said">') == min(reasons, 3) and ("further remark" in said) == (reasons > 3)
     assert ("should not be used" in page.text["apply"]) == (estimate.verdict.level == "FAIL")
 
 
@@ -161,7 +179,7 @@ def test_what_was_rejected_is_listed_with_its_reason() -> None:
 
 
 def test_fixed_parameters_and_correlated_pairs_are_named() -> None:
-    problem, estimate = kuka(12, unknown=("base",), share=0.1)
+    problem, estimate = kuka(12, unknown=("base",), share=0.1, error_model=ErrorModel.paper())
     assert estimate.observability.fixed and estimate.fit.correlations
     text = " ".join(Page(report_page(calibration_report(problem, estimate))).text["parameters"].split())
     for name, combination in zip(
@@ -206,7 +224,7 @@ def test_two_hundred_configurations_stay_below_a_megabyte() -> None:
 
 
 def test_many_rows_thin_the_drawing_and_say_so_but_never_the_numbers() -> None:
-    problem, estimate = kuka(1500, gross=4, loss="robust", starts=0)
+    problem, estimate = kuka(1500, gross=4, loss="robust")
     report = calibration_report(problem, estimate)
     page = Page(report_page(report))
     assert len(page.json["distances_after"]) == len(page.json["scene"]["points"]) == 1500
@@ -273,7 +291,9 @@ def test_residuals_by_joint_are_seen_in_the_joints_axes() -> None:
     along = robot.joint_jacobian(q).reshape(30, 1, 3, 2)[..., 1]
     along = along / np.linalg.norm(along, axis=2, keepdims=True)
     pushed = points + 1e-3 * along + [0, 0, 2e-3]
-    problem = IdentificationProblem(robot, Measurements(robot.joint_names, q, pushed), joint_corrections="off")
+    problem = IdentificationProblem(
+        robot, Measurements(robot.joint_names, q, pushed), error_model=ErrorModel.paper()
+    )
     estimate = identify(problem)
     estimate = replace(estimate, residuals=replace(estimate.residuals, vectors=pushed - points))
     found = joint_residuals(calibration_report(problem, estimate))[1]
@@ -300,7 +320,15 @@ def test_a_measured_robot() -> None:
     apply = page.text["apply"]
     assert "--urdf-output calibrated.urdf" in apply and str(folder / "irb120.urdf") in apply
     assert "compensate --robot" in apply and len(page.json["scene"]["points"]) == 108
-    assert ("The joint corrections are not in it" in apply) == (estimate.transmission is not None)
+    assert "It holds placement alone: gravity and joint functions are not in it" in apply
+    terms = page.text["accuracy"]
+    assert all(t.name in terms and MEANINGS[t.name] in terms for t in estimate.terms)
+    kept = {t.name: t.kept for t in estimate.terms}
+    assert kept["gravity"] and terms.count("left out", terms.index("What moves")) == 1 + [*kept.values()].count(
+        False
+    )
+    words = "What each joint turns beyond its reading"
+    assert words in page.text["residuals"] and "by gravity" in page.text["residuals"]
 
 
 # ── provenance ───────────────────────────────────────────────────────────────────────────────────────

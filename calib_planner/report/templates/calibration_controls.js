@@ -160,5 +160,8 @@
   set({ robot: robotOf.get(scene.rows[worst]) || 0, point: worst });
   snapshot();
   window.addEventListener("beforeprint", snapshot);
+  window.addEventListener("beforeprint", () => {
+    document.querySelectorAll("details").forEach((d) => { d.open = true; });
+  });
   window.addEventListener("resize", redraw);
 })();
