@@ -242,7 +242,7 @@ def test_parallel_axes_hide_their_d_and_the_twist_between_them(tmp_path):
 
     cell = SimulatedCell(robot, {"j2.d": 1e-3, "j3.d": 5e-4, "j2.a": 1e-3}, 1e-5)
     asked = robot.with_parameters("j2.d,j3.d,j2.a")
-    found = identify(IdentificationProblem(asked, cell.measure(q, 1, 0), sigma=1e-5))
+    found = identify(IdentificationProblem(asked, cell.measure(q, 1, 0), 1e-5, ErrorModel.paper()))
     assert len(found.observability.fixed) == 1 and "j3.d" in str(found.observability.fixed) + str(
         found.to_dict()["unidentifiable"]
     )
