@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from calib_planner.robot.elements import Element
 
 try:
-    from calib_planner.robot import _kernel  # type: ignore[attr-defined]
+    import calib_planner.robot._kernel as _kernel  # type: ignore[import-not-found]
 except ImportError:  # not built: NumPy does the same, more slowly
     _kernel = None
 
