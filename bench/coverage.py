@@ -13,9 +13,9 @@ last three sections take fewer seeds: two fifths, a tenth, two fifths.
                the robust loss over that of the same set before it was spoilt; missed and false alarms. A fit to
                fewer points errs more even if it knew which: ``fewest`` is that, a fit to the good points alone.
 ``breakdown``  The same without exchanged rows for 10 … 45 % of gross errors.
-``scales``     Estimated scales of the error model over those simulated, root mean square over the seeds; the floor
-               holds the noise where nobody states it. How often a term was dropped that is there, and kept that is
-               not.
+``scales``     Estimated scales of the error model over those simulated, root mean square over the seeds; the
+               floor holds the noise where nobody states it. How often a term was dropped that is there, and
+               kept that is not.
 
 The table goes to stderr; the figures, JSON, to FILE or stdout.
 """
