@@ -1,7 +1,7 @@
 """Simulated cells for the benches: everything drawn from a seed, wrong in the ways that a case says.
 
-Model discrepancy is an error of each joint's transmission, a random function of its angle with a squared
-exponential spectrum, and a white error of each configuration and target. Gross errors: 10–50 mm, any direction.
+How the robot errs is drawn from the error model (``error_model.Truth``). Gross errors come on top: 10–50 mm, in
+any direction.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from calib_planner import IdentificationProblem, Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import Prior
-from calib_planner.identification import Estimate, start_robot
+from calib_planner.error_model import ErrorModel, Prior, Truth, typical
+from calib_planner.identification import Estimate
 from calib_planner.measurements import Measurements
-from calib_planner.robot import rotation
+from calib_planner.robot import is_nuisance, rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 SIGMA, LENGTH, ANGLE = 3e-5, 5e-4, 1e-3
 TARGETS = np.array([[0.05, 0.02, 0.12], [-0.06, 0.04, 0.10], [0.01, -0.07, 0.14]])
+OPTIONAL = ("gravity", "smooth.size", "short.size", "repeatability", "shared", "floor")
+"""Scales of what a robot may do besides its parameters."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,9 @@ class Case:
         placed: Base and targets are unknown.
         targets: Number of reflectors.
         count, repetitions: Configurations, and how often each is measured.
+        asked: The error model of the identification: ``paper``, ``typical``, or what ``typical`` is without.
         options: Further arguments of the problem.
-        turning: Transmission errors, root mean square [rad], with correlation length ``length`` [rad].
-        white: Error of each configuration and target, per coordinate [m].
+        scales: Scales of the true error model that are not nothing; empty: the paper's robot.
         gross: Share of the points that are gross errors; a hundredth of the rows are exchanged if ``exchanged``.
         prior: The true errors are drawn from the prior that is given.
     """
@@ -47,13 +49,26 @@ class Case:
     targets: int = 1
     count: int = 20
     repetitions: int = 1
+    asked: str = "paper"
     options: dict[str, Any] = field(default_factory=dict)
-    turning: float = 0.0
-    length: float = 0.07
-    white: float = 0.0
+    scales: dict[str, float] = field(default_factory=dict)
     gross: float = 0.0
     exchanged: bool = False
     prior: bool = False
+
+    @property
+    def true_model(self) -> ErrorModel:
+        """How the robot errs besides its parameters."""
+        if not self.scales:
+            return ErrorModel.paper(SIGMA)
+        return typical().with_noise(SIGMA).with_values(dict.fromkeys(OPTIONAL, 1e-12) | self.scales)
+
+    @property
+    def asked_model(self) -> ErrorModel:
+        """What is identified."""
+        if self.asked in ("paper", "typical"):
+            return ErrorModel.paper() if self.asked == "paper" else typical()
+        return typical().without(self.asked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,31 +76,29 @@ class Cell:
     """A cell, the question about it, and what it draws from."""
 
     case: Case
-    truth: SimulatedCell
+    cell: SimulatedCell
     asked: Robot
     prior: Prior | None
     rng: np.random.Generator
-    waves: tuple[FloatArray, FloatArray]
+
+    @property
+    def truth(self) -> Truth:
+        """The true robot."""
+        return self.cell.truth
 
     def configurations(self, count: int) -> FloatArray:
         low, high = self.asked.joint_limits.T
         return np.asarray(self.rng.uniform(low, high, (count, len(low))))
 
-    def points(self, q: FloatArray) -> FloatArray:
-        """Where the targets really are."""
-        orders = np.arange(1, len(self.waves[0]) + 1)
-        turns = orders[:, None] * q[:, None, :]
-        error = np.sum(np.cos(turns) * self.waves[0] + np.sin(turns) * self.waves[1], axis=1)
-        points = self.truth.truth.positions(q + error)
-        return np.asarray(points + self.case.white * self.rng.standard_normal(points.shape))
-
     def measure(self, q: FloatArray, repetitions: int) -> Measurements:
-        """``repetitions`` 0: once each, the first one three times."""
-        often = np.full(len(q), max(repetitions, 1))
-        often[0] = repetitions or 3
-        points = np.repeat(self.points(q), often, axis=0)
-        noisy = points + SIGMA * self.rng.standard_normal(points.shape)
-        return Measurements(self.asked.joint_names, np.repeat(q, often, axis=0), noisy)
+        """Each of q (N, joints) ``repetitions`` times."""
+        rows = np.repeat(q, repetitions, axis=0)
+        return Measurements(self.asked.joint_names, rows, self.truth.measure(rows, self.rng))
+
+    def problem(self, data: Measurements, **changes: Any) -> IdentificationProblem:
+        """The question about ``data``."""
+        options: dict[str, Any] = {"prior": self.prior, **self.case.options, **changes}
+        return IdentificationProblem(self.asked, data, error_model=self.case.asked_model, **options)
 
 
 def cell_of(case: Case, seed: int) -> Cell:
@@ -104,12 +117,9 @@ def cell_of(case: Case, seed: int) -> Cell:
     if case.prior:
         std = np.array([LENGTH if p.unit == "m" else ANGLE for p in real.parameters])
         prior = Prior(real.parameter_names, np.array([p.nominal for p in real.parameters]), std)
-    orders = np.arange(1, int(6.0 / case.length) + 6)
-    share = np.exp(-((orders * case.length) ** 2) / 2.0)
-    size = case.turning * np.sqrt(share / share.sum())[:, None]
-    waves = size * rng.standard_normal((2, len(orders), len(real.joint_names)))
-    truth = SimulatedCell(real, random_deviations(real, seed, LENGTH, ANGLE), SIGMA)
-    return Cell(case, truth, asked, prior, rng, (waves[0], waves[1]))
+    errors = random_deviations(real, seed, LENGTH, ANGLE)
+    cell = SimulatedCell(real, errors, SIGMA, error_model=case.true_model, seed=seed)
+    return Cell(case, cell, asked, prior, rng)
 
 
 def spoil(data: Measurements, case: Case, rng: np.random.Generator) -> tuple[Measurements, NDArray[np.bool_]]:
@@ -128,19 +138,27 @@ def spoil(data: Measurements, case: Case, rng: np.random.Generator) -> tuple[Mea
     return Measurements(data.joint_names, data.q, points), bad
 
 
-def true_deviations(problem: IdentificationProblem, found: Estimate, cell: Cell) -> FloatArray:
-    """(P,) deviations that reproduce the true robot, those held as they are."""
-    if not cell.case.placed:
-        return np.array([cell.truth.deviations[name] for name in found.fit.parameters])
-    robot = start_robot(problem.robot, problem.data, robust=problem.loss == "robust")
-    kept = np.flatnonzero(np.isfinite(found.fit.std))
+def parameter_errors(found: Estimate, cell: Cell) -> dict[str, float]:
+    """Identified − true in standard deviations, of every parameter that has one and a true value.
+
+    Without a prior the truth is what reproduces the true robot with the same parameters fixed: a combination that
+    nothing shows was divided by a choice. With one, it is what the chain was drawn with; base and targets, of
+    which the true robot has other coordinates, are left out.
+    """
+    fit = found.fit
+    if cell.case.asked != "paper" or cell.prior is not None or not cell.case.placed:
+        own = {p.name: p.nominal for p in cell.truth.robot.parameters}
+        rows = [(n, v, s) for n, v, s in zip(fit.parameters, fit.values, fit.std, strict=True) if n in own]
+        return {n: (v - own[n]) / s for n, v, s in rows if np.isfinite(s) and not is_nuisance(n)}
+    robot, free = found.knowledge.robot, np.flatnonzero(np.isfinite(fit.std))
     low, high = robot.joint_limits.T
     q = np.random.default_rng(1).uniform(low, high, (100, len(low)))
-    truth, deviations = cell.truth.truth.positions(q).ravel(), found.fit.deviations.copy()
+    truth, deviations = cell.truth.robot.positions(q).ravel(), fit.deviations.copy()
     for _ in range(6):
-        jacobian = np.ascontiguousarray(robot.jacobian(q, deviations)).reshape(len(truth), -1)[:, kept]
+        jacobian = np.ascontiguousarray(robot.jacobian(q, deviations)).reshape(len(truth), -1)[:, free]
         scale = np.linalg.norm(jacobian, axis=0)
         left = truth - robot.positions(q, deviations).ravel()
-        deviations[kept] += np.linalg.lstsq(jacobian / scale, left, rcond=1e-12)[0] / scale
+        deviations[free] += np.linalg.lstsq(jacobian / scale, left, rcond=1e-12)[0] / scale
     assert np.abs(truth - robot.positions(q, deviations).ravel()).max() < 1e-9
-    return deviations
+    error = (fit.deviations - deviations)[free] / fit.std[free]
+    return {fit.parameters[i]: float(e) for i, e in zip(free, error, strict=True)}

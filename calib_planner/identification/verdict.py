@@ -22,8 +22,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import bdtr
 
-from calib_planner.identification.estimate import Estimate, LeftOutError, Reason, Validation, Verdict, chance_of
+from calib_planner.identification.estimate import (
+    CHANCE,
+    Estimate,
+    LeftOutError,
+    Reason,
+    Validation,
+    Verdict,
+    chance_of,
+)
 from calib_planner.units import counted, length, listed
 
 LARGEST_RESIDUAL = 5e-3
@@ -32,8 +41,8 @@ LARGE_RESIDUAL = 1e-3
 """Measured robots are left with 0.1 to 0.45 mm: less than twice the largest of these is not looked into [m]."""
 LITTLE = 0.5
 """Share of the error before that is left after a fit that explains little."""
-MANY, INSIDE = 30, 0.8
-"""Of at least this many held-out points, at least this share must lie in their 95 % region."""
+INSIDE = 0.8
+"""Share of the held-out points below which too few of them lie in their 95 % region."""
 APART = 1.5
 """Achieved over predicted error beyond which a prediction is not kept."""
 SYSTEMATIC = ("gravity", "smooth", "short")
@@ -351,6 +360,12 @@ def _held_out(e: Estimate) -> Iterator[Reason]:
         yield from _validation(e.validation, "held-out points", e.accuracy.required)
 
 
+def _by_chance(v: Validation) -> float:
+    """Probability that no more held-out points lie in their 95 % region; three degrees of freedom are a point."""
+    count = max(round(v.freedom / 3.0), 1)
+    return float(bdtr(round(v.within_95 * count), count, 0.95))
+
+
 def _validation(v: Validation, points: str, required: float) -> Iterator[Reason]:
     if v.mean >= v.before_mean:
         yield RULES["no_gain_held_out"].reason(points=points, after=length(v.mean), before=length(v.before_mean))
@@ -359,7 +374,7 @@ def _validation(v: Validation, points: str, required: float) -> Iterator[Reason]
         yield _graded(
             "predicted_and_achieved", _exceeded(v), points=points, achieved=achieved, predicted=predicted
         )
-    if v.count >= MANY and v.within_95 < INSIDE:
+    if v.within_95 < INSIDE and _by_chance(v) < CHANCE:
         yield RULES["region"].reason(points=points, share=f"{100 * v.within_95:.0f}")
     if np.isfinite(required):
         yield _achieved("required_accuracy: held out", v, required, points=points)

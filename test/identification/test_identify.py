@@ -212,7 +212,7 @@ def read_irb120(name, targets):
 
 @pytest.mark.parametrize(
     ("level", "model", "rank", "mean"),
-    [("offsets", "typical", 21, 0.48e-3), ("full", "paper", 33, 0.33e-3), ("full", "typical", 51, 0.145e-3)],
+    [("offsets", "paper", 19, 0.60e-3), ("full", "paper", 33, 0.33e-3), ("full", "typical", 51, 0.145e-3)],
 )
 def test_real_robot_held_out_error(level, model, rank, mean):
     """ABB IRB 120: 36 configurations × 3 points fitted, 40 others of a re-seated target predicted."""
