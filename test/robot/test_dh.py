@@ -11,6 +11,7 @@ import yaml
 from robots import SHARED_DATA, random_configurations
 
 from calib_planner import FileFormatError, IdentificationProblem, Robot, identify
+from calib_planner.error_model import ErrorModel
 from calib_planner.simulation import SimulatedCell
 
 STEP = 1e-30
