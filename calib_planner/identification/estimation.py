@@ -40,6 +40,7 @@ from calib_planner.identification.doubt import (
 )
 from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import (
+    UNBOUNDED,
     LinearProblem,
     Solution,
     exchange,
@@ -67,6 +68,8 @@ FAR = 30.0
 """Points this many medians away are doubted from the start."""
 BENT = 1e-3
 """Predictions that move by more than this are looked at before the step is taken [m]."""
+SWELLS = 10.0
+"""Scales of visits and points this many times their median are taken for gross errors until that is disproved."""
 MOST_DOUBTS = 8
 """Most rounds in which impossible points come and go."""
 MATERIAL = 3.0
@@ -253,19 +256,34 @@ class _Work:
                 break
         return solution
 
-    def doubt(self, solution: Solution) -> Solution:
-        """Take the weight of what is impossible, and fit again."""
+    def doubt(self, solution: Solution, squares: FloatArray) -> Solution:
+        """Take the weight of what is impossible, and fit again.
+
+        Where many are wrong, it is begun anew as the registration saw them: ``squares`` (N, targets), how far
+        each point was from where the others had put it [m²]. A fit of all points alike may have come to terms
+        with gross errors that are alike.
+        """
         solution = self._without_run(solution)
-        if many_are_wrong(solution, self.state.doubt):
+        if many_are_wrong(solution, self.state.doubt) or self.swollen():
+            model = self.state.model.with_values({s.name: s.median for s in self.state.model.scales})
+            self.state = _State(np.zeros(len(self.state.coefficients)), model, np.maximum(squares, self.shifted))
+            self.settle(MOST_STARTS, 0)
             for _ in range(STUDENT_ROUNDS):
+                solution = self.settle(1, 3)
                 old = self.state.doubt
                 new = np.maximum(student(solution, old), self.shifted)
                 self.state = replace(self.state, doubt=new)
-                solution = self.settle(1, 3)
                 own = np.trace(solution.problem.covariance, axis1=1, axis2=2).min() / new.shape[1]
                 if np.abs(np.log((new + own) / (old + own))).max() < 0.1:
                     break
+            solution = self.settle(1, 3)
         return self.reconsider(solution, MOST_DOUBTS, 30)
+
+    def swollen(self) -> bool:
+        """Whether what is new at visits and points is larger than robots and instruments make it."""
+        model = self.state.model
+        new = {n for term in (model.visits, model.points) if term is not None for n in term.scales}
+        return any(s.value > SWELLS * s.median for s in model.scales if s.name in new and s.factor < UNBOUNDED)
 
     def reconsider(self, solution: Solution, rounds: int, scales: int) -> Solution:
         """Only what is impossible stays doubted; fit again as long as that changes."""
@@ -357,7 +375,7 @@ def fit_error_model(
 def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool) -> ModelEstimate:
     """The same for clean arguments."""
     asked = model
-    robot, far = _placed(robot, data)
+    robot, far, squares = _placed(robot, data)
     model = _with_gravity_as_stated(model, robot, data)
     some = _some(data)
     part = data if some is None else data.select(some)
@@ -367,7 +385,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
     work.settle(MOST_STARTS, 0)
     solution = work.settle(MOST_ROUNDS)
     if robust:
-        solution = work.doubt(solution)
+        solution = work.doubt(solution, squares if some is None else squares[some])
     gains: dict[str, float] = {}
     if choose:
         solution, gains = work.choose_terms(solution)
@@ -620,12 +638,12 @@ def _with_doubt(parts: Mapping[str, FloatArray], doubt: FloatArray) -> dict[str,
 # ── the parts of a full fit ──────────────────────────────────────────────────────────────────────────
 
 
-def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
-    """``robot`` with unknown base and targets where they fit the nominal chain best, and D of far points.
+def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray, FloatArray]:
+    """``robot`` with unknown base and targets where they fit the nominal chain best; D of far points; squares.
 
     Each point weighs by how far it is from where the others put it (Cauchy, with the median as scale): some that
     are wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the
-    start.
+    start. The squares are those of the distances, (N, targets) [m²].
     """
     base, tool = _unknown_places(robot)
     weights, seen = data.seen.astype(float), data.seen
@@ -641,7 +659,7 @@ def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
         settled, weights = np.abs(new - weights).max() < 0.01, new
         if settled:
             break
-    return put, np.where(length > FAR * median, OUT * length**2, 0.0)
+    return put, np.where(length > FAR * median, OUT * length**2, 0.0), length**2
 
 
 def _with_gravity_as_stated(model: ErrorModel, robot: Robot, data: Measurements) -> ErrorModel:
