@@ -74,6 +74,8 @@ MOST_DOUBTS = 8
 """Most rounds in which impossible points come and go."""
 MATERIAL = 3.0
 """A run that is shifted by fewer standard deviations of a point is left alone."""
+COMMON = 2.0
+"""A shift of a run is that many times as large as its visits differ, or it is none."""
 LEAST = 1e-8
 """Predictions that move by less than this stand still [m]."""
 STILL = 1e-3
@@ -307,11 +309,13 @@ class _Work:
         doubt[run] = np.where(self.data.seen[run], min(far, LARGEST * own), 0.0)
         self.state = replace(self.state, doubt=np.maximum(doubt, self.state.doubt))
         without = self.settle(MOST_ROUNDS)
-        # The median: one gross point does not make a shift of the visits beside it.
-        shift = np.median(left_out(without).residuals[run][self.data.seen[run]], axis=0)
+        # Medians, and a shift that most share: gross points do not make one of the sound visits between them.
+        apart = left_out(without).residuals[run][self.data.seen[run]]
+        shift = np.median(apart, axis=0)
+        scatter = float(np.median(np.linalg.norm(apart - shift, axis=1)))
         rest = without.problem.covariance[np.setdiff1d(np.arange(len(doubt)), run)]
         std = np.sqrt(np.median(np.trace(rest, axis1=1, axis2=2)) / doubt.shape[1])
-        if np.linalg.norm(shift) > MATERIAL * std:
+        if np.linalg.norm(shift) > max(MATERIAL * std, COMMON * scatter):
             self.shifted = doubt
             return without
         self.state, self.rounds, self.converged = before
