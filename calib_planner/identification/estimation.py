@@ -230,10 +230,14 @@ class _Work:
         prior = np.sum(problem.standard(coefficients[problem.random] - problem.means) ** 2)
         return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
 
+    def here(self, coefficients: FloatArray) -> Robot:
+        """The robot with the parameters of β (coefficients,)."""
+        names = self.robot.parameter_names
+        return self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
+
     def _poses(self, coefficients: FloatArray) -> Poses:
         """Parameters and deflected joints at β (coefficients,)."""
-        names = self.robot.parameter_names
-        here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
+        here = self.here(coefficients)
         poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
         return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
 
@@ -380,7 +384,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
     """The same for clean arguments."""
     asked = model
     robot, far, squares = _placed(robot, data)
-    model = _with_gravity_as_stated(model, robot, data)
+    model = _with_payload(model, data)
     some = _some(data)
     part = data if some is None else data.select(some)
     work = _Work(robot, part, model)
@@ -444,6 +448,8 @@ def _knowledge(work: _Work, covariance: FloatArray, hidden: FloatArray) -> Knowl
         # What was said of these points is what is expected of others.
         usual = Isotropic(float(np.sqrt(np.mean(np.asarray(data.std)[data.seen] ** 2))))
         told = replace(told, points=replace(told.points, noise=usual))
+    if told.gravity is not None:
+        told = replace(told, gravity=told.gravity.placed(work.here(work.state.coefficients)))
     return Knowledge(work.robot, told, work.state.coefficients, covariance, hidden)
 
 
@@ -507,8 +513,8 @@ def _updated(
 
     That is so if ``start`` is of another robot or model, did not converge or left a direction hidden; if it has
     no terms with scales (the paper's model: a full fit is as quick); if there are ``GROWN`` times as many visits
-    as the scales come from, or most of these went; if the squared left-out residuals changed by a factor of
-    ``OFF``; or if a visit that went was the only one to tell something.
+    as the scales come from, or most of these went; if the first payload came; if the squared left-out residuals
+    changed by a factor of ``OFF``; or if a visit that went was the only one to tell something.
     """
     origin, old = start.origin, start.solution.problem
     placed = old.robot
@@ -518,6 +524,8 @@ def _updated(
         return None
     rows = _common(origin.data, data)
     stays = rows >= 0
+    if _with_payload(old.model, data) is not old.model:
+        return None
     if len(data) > GROWN * origin.visits or stays.sum() < origin.visits / GROWN:
         return None
     work = _Work(placed, data, old.model)
@@ -666,15 +674,12 @@ def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray, FloatA
     return put, np.where(length > FAR * median, OUT * length**2, 0.0), length**2
 
 
-def _with_gravity_as_stated(model: ErrorModel, robot: Robot, data: Measurements) -> ErrorModel:
-    """The model whose elastic term knows how the robot is mounted and what it carried, from base and data."""
-    if model.gravity is None:
-        return model
-    gravity = model.gravity.placed(robot)
+def _with_payload(model: ErrorModel, data: Measurements) -> ErrorModel:
+    """The model with a payload at the tip if the data hold one that its elastic term does not know."""
     heaviest = 0.0 if data.payload is None else float(np.asarray(data.payload).max())
-    if heaviest > 0.0 and gravity.payload is None:
-        gravity = gravity.with_payload(Payload(heaviest))
-    return replace(model, gravity=gravity)
+    if model.gravity is None or model.gravity.payload is not None or not heaviest:
+        return model
+    return replace(model, gravity=model.gravity.with_payload(Payload(heaviest)))
 
 
 def _some(data: Measurements) -> FloatArray | None:
