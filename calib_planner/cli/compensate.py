@@ -20,8 +20,10 @@ from calib_planner.cli.arguments import (
     option,
     switch,
 )
+from calib_planner.cli.gravity import add_payload, payload_of
 from calib_planner.cli.terminal import Terminal
 from calib_planner.compensation import STATUS, Compensation, compensate
+from calib_planner.error_model import Knowledge, Payload
 from calib_planner.errors import InputError
 from calib_planner.io import calibrated_robot, format_table, read_configurations, read_estimate, write_text
 from calib_planner.robot import Robot
@@ -34,7 +36,8 @@ DESCRIPTION = """Correct joint targets so that the real tool goes where the nomi
 The CSV of targets has a column per joint [rad | m], in any order. What is written has the same rows: the
 corrected joints [rad | m], what remains (position_error [m], rotation_error [rad]), and reached: 1, or 0 where
 the row could not be reached exactly and is the closest there is. Joint limits are respected. Where the base
-stands before the tracker plays no part. Gravity and joint functions that the estimate holds are applied."""
+stands before the tracker plays no part. Gravity and joint functions that the estimate holds are applied: gravity
+for the robot as it was mounted, with the payload that is stated."""
 
 ERRORS = ("position_error", "rotation_error", "reached")
 
@@ -49,6 +52,7 @@ def add(commands: Commands, summary: str) -> None:
     switch(what, "--position-only", "only the position of a point counts, not how the tool is turned")
     text = "that point, in the frame of the last link [m] (the first reflector, as identified)"
     option(what, "--tool", '"x y z"', text, kind=numbers)
+    add_payload(what, "the one that the estimate was made with")
     text = "placement alone, without gravity and joint functions: what a calibrated URDF does"
     switch(what, "--geometry-only", text)
     switch(what, "--ignore-limits", "joint limits do not matter")
@@ -59,7 +63,10 @@ def add(commands: Commands, summary: str) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     nominal = load_robot(args)
     saved = read_estimate(args.estimate)
-    errors = None if args.geometry_only or saved.learnt is None else saved.knowledge(nominal)
+    errors = None if args.geometry_only or saved.learnt is None else _carrying(args, saved.knowledge(nominal))
+    if errors is None and args.payload is not None:
+        got = "--geometry-only beside it" if args.geometry_only else "an estimate without an error model"
+        raise InputError("--payload", got, "an estimate by an error model, and its gravity")
     calibrated = calibrated_robot(nominal, saved) if errors is None else errors.placed
     if args.position_only and args.tool is None:
         # The same point of the tool on both robots: a nominal place of a reflector is no more than a guess.
@@ -104,6 +111,17 @@ def _without_model(document: dict[str, Any]) -> str:
     if document.get("joint_corrections") is not None:
         text += "; its joint corrections are of an older version and are not applied"
     return f"{text}: identify again for the whole correction"
+
+
+def _carrying(args: argparse.Namespace, known: Knowledge) -> Knowledge:
+    """The robot with the payload of --payload; at the place stated at its identification if only its mass is."""
+    stated, gravity = payload_of(args), known.model.gravity
+    if stated is None or gravity is None:
+        return known
+    mass, place = stated
+    if len(args.payload) == 1 and gravity.payload is not None:
+        place = gravity.payload.xyz
+    return known.carrying(Payload(mass, place) if mass else None)
 
 
 def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:

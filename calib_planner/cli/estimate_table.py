@@ -26,7 +26,7 @@ WORDS = {
     "WARN": "WARN: usable, but look at the reasons",
     "FAIL": "FAIL: do not rely on this calibration",
 }
-HEADINGS = ("count", "mean before", "mean after", "median", "rms", "max", "rms predicted", "in 95 %")
+HEADINGS = ("count", "mean before", "mean after", "rms", "max", "rms predicted", "in 95 %")
 MOST_POINTS = 10
 MOST_COMBINATIONS = 8
 MOST_POSES = 6
@@ -92,12 +92,12 @@ def _distances(estimate: Estimate) -> Table:
     for heading in HEADINGS:
         table.add_column(heading, justify="right")
     before, after = estimate.residuals.before, estimate.residuals.after
-    cells = [milli(before.mean), milli(after.mean), "", milli(after.rms), milli(after.max)]
+    cells = [milli(before.mean), milli(after.mean), milli(after.rms), milli(after.max)]
     table.add_row("fitted", str(estimate.points.used), *cells)
     systematic = len(estimate.knowledge.model.systematic) > 1
     if systematic:
         alone = estimate.residuals.placement_alone
-        cells = ["", milli(alone.mean), "", milli(alone.rms), milli(alone.max)]
+        cells = ["", milli(alone.mean), milli(alone.rms), milli(alone.max)]
         table.add_row("… placement alone", "", *cells)
     _add_left_out(table, "left out, visit by visit", estimate.left_out)
     if systematic:
@@ -106,18 +106,18 @@ def _distances(estimate: Estimate) -> Table:
         v = estimate.validation
         table.add_row("held out", str(v.count), *_held_out(v))
         if systematic:
-            cells = ["", milli(v.placement_mean), "", milli(v.placement_rms)]
+            cells = ["", milli(v.placement_mean), milli(v.placement_rms)]
             table.add_row("… placement alone", "", *cells)
     return table
 
 
 def _add_left_out(table: Table, label: str, left: LeftOutError) -> None:
     lengths = [milli(v) for v in (left.rms, left.max, left.predicted_rms)]
-    table.add_row(label, str(left.count), "", milli(left.mean), "", *lengths, "")
+    table.add_row(label, str(left.count), "", milli(left.mean), *lengths, "")
 
 
 def _held_out(v: Validation) -> list[str]:
-    lengths = (v.before_mean, v.mean, v.median, v.rms, v.max, v.predicted_rms)
+    lengths = (v.before_mean, v.mean, v.rms, v.max, v.predicted_rms)
     inside = f"{100 * v.within_95:.0f} %" if np.isfinite(v.within_95) else "unknown"
     return [*(milli(v) for v in lengths), inside]
 

@@ -28,6 +28,7 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.estimate_table import show_estimate
+from calib_planner.cli.gravity import add_gravity, error_model_of, gravity_note
 from calib_planner.cli.terminal import Terminal
 from calib_planner.error_model import ACCURACIES, Prior, with_tolerances
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
@@ -44,7 +45,6 @@ from calib_planner.io import (
     SourceSettings,
     is_bag,
     placement,
-    read_error_model,
     read_instrument,
     read_prior,
     read_source,
@@ -79,6 +79,7 @@ def add(commands: Commands, summary: str) -> None:
     add_parameters(parser)
     add_data(parser)
     add_noise(parser)
+    add_gravity(parser)
     add_prior(parser)
     add_checks(parser)
     add_outputs(parser)
@@ -104,6 +105,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     data = {"data": [{"file": s.path, "rows": len(s.data)} for s in sources.files]}
     result = estimate.to_dict() | plain(placement(estimate)) | data | written
     terminal.answer(result, partial(show_estimate, estimate, where=sources.where))
+    if problem.error_model is not None and problem.error_model.gravity is not None:
+        terminal.note(gravity_note(estimate.knowledge.model.gravity, problem.error_model.gravity, robot))
     if not settled:
         raise CalibPlannerError(estimate.fit.message + (" Nothing was written." if _outputs(args) else ""))
     tell_outputs(args, written, terminal)
@@ -112,7 +115,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
 def _problem(
     robot: Robot, sources: Sources, args: argparse.Namespace, terminal: Terminal
 ) -> IdentificationProblem:
-    model = read_error_model(args.error_model)
+    model = error_model_of(args, robot, sources.data)
     if args.prior == TYPICAL:
         model = with_tolerances(model)
     return IdentificationProblem(

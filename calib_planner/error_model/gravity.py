@@ -88,8 +88,8 @@ class Gravity:
         masses: What hangs on the joints beside a payload; empty: unit masses at elbow, wrist and tip.
         mounting: ``floor``, ``ceiling``, or the direction downwards (3,) in the frame of the robot's base.
         payload: The payload; ``None``: nothing is known of one.
-        vertical: The direction upwards (3,) in the frame of the points, from which the mounting follows as soon
-            as the base is placed (``placed``); ``None``: the mounting is as it says.
+        vertical: The direction upwards (3,) in the frame of the points, which goes before the mounting; this
+            follows from it when the base is identified (``placed``). ``None``: the mounting is as it says.
     """
 
     masses: tuple[Mass, ...] = ()
@@ -179,7 +179,7 @@ class Gravity:
     def _moments(self, poses: Poses) -> FloatArray:
         """(N, K) τ [m], or the force along a sliding joint, of a unit weight."""
         robot, posture = poses.robot, poses.posture
-        down = robot.base_pose[0] @ self.down
+        down = robot.base_pose[0] @ self.placed(robot).down
         turns, joints = robot.joint_is_revolute, len(robot.joint_names)
         total: dict[str, FloatArray] = {}
         for part in self.masses_of(robot):

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, check_configurations
+from calib_planner.error_model.gravity import PAYLOAD, Payload
 from calib_planner.error_model.model import ErrorModel
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
@@ -141,6 +142,36 @@ class Knowledge:
         clean = check_configurations("configurations", q, self.robot.joint_names)
         readings = Poses(self.placed, clean, self.model.payloads(payload, len(clean)))
         return self.model.deflected(readings, self.coefficients)
+
+    def carrying(self, payload: Payload | None) -> Knowledge:
+        """The same robot when it carries this payload, or none: what it knows of its joints stays.
+
+        A joint's coefficient is its compliance times the weight of what was carried, whose centre of gravity does
+        not matter; so it grows with the mass. Where the measurements show no gravity, no payload matters.
+
+        Raises:
+            InputError: A payload, where the measurements had none that could tell what it does.
+        """
+        gravity = self.model.gravity
+        if gravity is None or gravity.payload == payload:
+            return self
+        if gravity.payload is None:
+            assert payload is not None
+            self.model.payloads(payload.mass, 1)
+        model = replace(self.model, gravity=replace(gravity, payload=payload))
+        old = self.model.names(self.robot)
+        place = [old.index(name) for name in model.names(self.robot)]
+        factor = np.ones(len(place))
+        if payload is not None and gravity.payload is not None:
+            own = [i for i, name in enumerate(model.names(self.robot)) if name.startswith(f"gravity.{PAYLOAD}.")]
+            factor[own] = payload.mass / gravity.payload.mass
+        return replace(
+            self,
+            model=model,
+            coefficients=self.coefficients[place] * factor,
+            covariance=self.covariance[np.ix_(place, place)] * np.outer(factor, factor),
+            hidden=self.hidden[place] * factor[:, None],
+        )
 
     def actual(self, q: ArrayLike, payload: ArrayLike | None = None) -> FloatArray:
         """(N, joints) where the joints stand on average when they read ``q`` (N, joints) [rad | m].

@@ -30,6 +30,7 @@ predicted standard deviations: what moves nothing is a note, whatever its eviden
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, permutations
@@ -86,7 +87,9 @@ DOUBT_ROUNDS = 3
 """Most rounds in which doubts come and go when an alternative is fitted in full."""
 SCALE_ROUNDS = 6
 """Most steps of the scales in each of them."""
-MOST_POSES = 60
+REACH = 5.0
+"""Predicted errors within which a point belongs to another row or target."""
+MOST_POSES = 20
 """Measured configurations at which predictions are compared if there is no test pose."""
 
 
@@ -371,6 +374,8 @@ def find_alternatives(
 ) -> tuple[Alternative, ...]:
     """The alternatives that explain the measurements better than the error model alone, the best first.
 
+    None if the fit leaves more than any robot errs by: then only ``explain_gross`` may know.
+
     Args:
         robot: Nominal; names joints and targets.
         data: What ``fitted`` was estimated from, in the order of measuring.
@@ -382,6 +387,8 @@ def find_alternatives(
     if len(data) < 2 * FEWEST:
         return ()
     fine = _Fine(data, fitted, test_poses, accuracy_frame)
+    if fitted.left_out.rms > SOUND * _spread(fine.here.points):
+        return ()
     return tuple(fine.findings())
 
 
@@ -415,13 +422,27 @@ class _Fine:
 
     def questions(self, solution: Solution) -> Iterator[_Question]:
         """Every fine row of the table."""
+        yield from self._standing
+        yield from self._runs(solution)
+        yield from self._priors(solution)
+
+    @cached_property
+    def _stations(self) -> list[FloatArray]:
+        """Columns of a motion of the station, here and at the test poses."""
+        return [_station(p.points, self.centre) for p in (self.here, self.there)]
+
+    @cached_property
+    def _standing(self) -> tuple[_Question, ...]:
+        """The questions that are the same for every solution."""
+        return tuple(self._motions()) + tuple(self._joints(self.here, self.there, len(self.here.robot.targets)))
+
+    def _motions(self) -> Iterator[_Question]:
+        """What moves the station, the targets, or all distances."""
         here, there, n = self.here, self.there, len(self.data)
-        targets = len(here.robot.targets)
-        station = [_station(p.points, self.centre) for p in (here, there)]
+        targets, station = len(here.robot.targets), self._stations
         yield _Question("push", station[0], _split(station[1], targets), cut=True)
         order = np.linspace(0.0, 1.0, n)[:, None, None]
         yield _Question("drift", station[0] * order, _split(station[1], targets))
-        yield from self._runs(solution, station)
         tips = [tip_poses(p.robot, p.actual, at_base=False) for p in (here, there)]
         for t in range(targets):
             pair = [_at_target(r, t, targets) for r, _ in tips]
@@ -431,8 +452,6 @@ class _Fine:
             yield _Question("tool", pair[0], _split(pair[1], targets), cut=True)
         radial = here.points.reshape(n, -1, 1)
         yield _Question("scale", radial, np.zeros((len(there), targets, 3, 1)))
-        yield from self._joints(here, there, targets)
-        yield from self._priors(solution)
 
     def _joints(self, here: Poses, there: Poses, targets: int) -> Iterator[_Question]:
         """Steps of a joint's zero, gear ratios, couplings."""
@@ -452,9 +471,9 @@ class _Fine:
                 other = levers[1][..., [j]] * (there.q[:, k] / units[j])[:, None, None, None]
                 yield _Question(code, columns, other, joint=j, beside=None if k == j else k)
 
-    def _runs(self, solution: Solution, station: list[FloatArray]) -> Iterator[_Question]:
+    def _runs(self, solution: Solution) -> Iterator[_Question]:
         """The most suspicious run of visits."""
-        run = shifted_run(solution)
+        station, run = self._stations, shifted_run(solution)
         if run is None:
             return
         first, last = int(run[0]), int(run[-1]) + 1
@@ -493,10 +512,17 @@ class _Fine:
 
     def findings(self) -> Iterator[Alternative]:
         """The best alternative, then the best beside it, and so on."""
-        base = _Base(
-            self.problem, self.fitted.doubt, self.fitted.solution.coefficients, self.fitted.left_out.score
-        )
-        for _ in range(MOST_FINDINGS):
+        coefficients, score = self.fitted.solution.coefficients, self.fitted.left_out.score
+        there = self.problem.model.columns(self.there)
+        base, named = _Base(self.problem, self.fitted.doubt, coefficients, score, there), 0
+        wrong = self.fitted.doubt > 0
+        for exchanged in (_exchanged_targets, _exchanged_rows):
+            misplaced = exchanged(self.data.p, self.here.points, wrong, self._reach)
+            told = None if misplaced is None else self._put_back(misplaced, base)
+            if told is not None:
+                named, base = named + 1, told[1]
+                yield told[0]
+        for _ in range(MOST_FINDINGS - named):
             fits = [self._fitted_in_full(a, d, base) for a, d in self._suspicious(base)]
             better = [f for f in fits if f is not None]
             if not better:
@@ -571,7 +597,7 @@ class _Fine:
         for question, statistic in zip(single, _statistics(solution, [q.columns for q in single]), strict=True):
             tried = count
             if question.code == "prior":  # chosen from so many parameters
-                tried += float(len(self.problem.robot.parameter_names)) ** len(question.rows)
+                tried += float(len(self.problem.robot.parameter_names)) ** min(len(question.rows), 2)
             if question.code in ("block", "push"):  # chosen from so many runs
                 tried += n * n / 2.0
             yield _answer(solution, question, statistic, tried)
@@ -606,11 +632,10 @@ class _Fine:
         score = left_out(solution).score
         if not (again.counted < SIGNIFICANT and score > base.score):
             return None
-        amounts, poses = solution.coefficients[count:], self.columns_there.shape[2]
-        change = (
-            self.columns_there @ (solution.coefficients - np.append(base.coefficients, 0.0 * amounts))[:poses]
-        )
-        change = change.reshape(question.there.shape[:3]) + question.there @ amounts
+        amounts = solution.coefficients[count:]
+        own = question.there.reshape(len(self.poses), -1, len(amounts))
+        there = np.concatenate([base.there, own], axis=2)
+        change = there @ (solution.coefficients - np.append(base.coefficients, 0.0 * amounts))
         moved, deviations = self._moved(change)
         told = replace(
             self._told(question, amounts),
@@ -622,7 +647,34 @@ class _Fine:
             deviations=deviations,
             material=bool(deviations > MATERIAL),
         )
-        return told, _Base(solution.problem, doubt, solution.coefficients, score)
+        return told, _Base(solution.problem, doubt, solution.coefficients, score, there)
+
+    # ── points that belong elsewhere ─────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def _reach(self) -> float:
+        """A point this close to another prediction belongs there [m]."""
+        left = self.fitted.left_out
+        return REACH * float(np.nanmax([left.rms, left.predicted_rms, 1e-9]))
+
+    def _put_back(self, misplaced: _Misplaced, base: _Base) -> tuple[Alternative, _Base] | None:
+        """The alternative with the points where they belong; ``None``: they are no better there."""
+        old = base.problem
+        change = np.where(misplaced.moved[:, :, None], misplaced.points - self.data.p, 0.0).reshape(old.y.shape)
+        doubt = np.where(misplaced.moved, 0.0, base.doubt)
+        problem = self._with(replace(old, y=old.y + change), doubt)
+        solution, doubt = self._settled(problem, doubt)
+        score = left_out(solution).score
+        probability = _by_chance(misplaced, self.here.points, self._reach)
+        if not probability < SIGNIFICANT or (misplaced.moved.any() and not score > base.score):
+            return None
+        moved, deviations = self._moved(base.there @ (solution.coefficients - base.coefficients))
+        rows = misplaced.rows
+        told = _named(misplaced.code, len(rows), "1", misplaced.words, row=rows[0], rows=rows)
+        told = replace(told, gain=score - base.score, probability=probability, moved=moved, deviations=deviations)
+        return replace(told, material=deviations > MATERIAL), _Base(
+            problem, doubt, solution.coefficients, score, base.there
+        )
 
     def _settled(self, problem: LinearProblem, doubt: FloatArray) -> tuple[Solution, FloatArray]:
         """The solution with new scales; points that are possible now count, and those that are not do not."""
@@ -635,23 +687,28 @@ class _Fine:
             doubt, problem = new, self._with(solution.problem, new)
         return solution, doubt
 
-    @cached_property
-    def columns_there(self) -> FloatArray:
-        """(K, 3·targets, coefficients) J⁺ at the test poses."""
-        return self.problem.model.columns(self.there)
-
     def _moved(self, change: FloatArray) -> tuple[float, float]:
-        """Largest distance of ``change`` (K, targets, 3) [m], and in predicted standard deviations."""
-        frame = self.frame
-        if frame == "robot":
-            try:
-                change = without_rigid_motion(self.there.points, change.reshape(-1, 1)).reshape(change.shape)
-            except InputError:  # measured configurations that lie in a plane
-                frame = "world"
+        """Largest distance of ``change`` (K, 3·targets) [m], and in predicted standard deviations."""
+        change = self._framed(change.reshape(-1, 1)).reshape(len(self.poses), -1, 3)
         distances = np.sqrt(np.mean(np.sum(change**2, axis=2), axis=1))
-        promised = self.fitted.knowledge.accuracy(self.poses, frame).per_pose
-        shares = np.divide(distances, promised, out=np.zeros(len(distances)), where=promised > 0.0)
+        shares = np.divide(distances, self._promised, out=np.zeros(len(distances)), where=self._promised > 0.0)
         return float(distances.max()), float(shares.max())
+
+    def _framed(self, rows: FloatArray) -> FloatArray:
+        """Rows (3·K·targets, n) at the test poses, for ``robot`` without what a rigid motion explains."""
+        if self.frame == "robot":
+            with suppress(InputError):  # measured configurations that lie in a plane
+                return without_rigid_motion(self.there.points, rows)
+        return rows
+
+    @cached_property
+    def _promised(self) -> FloatArray:
+        """(K,) predicted error at the test poses [m], (M3)."""
+        known = self.fitted.knowledge
+        columns = known.model.columns(known.poses(self.poses))
+        rows = self._framed(columns.reshape(-1, columns.shape[2]))
+        squares = np.sum((rows @ known.covariance) * rows, axis=1).reshape(len(self.poses), -1)
+        return np.sqrt(squares.sum(axis=1) / len(known.robot.targets))
 
     # ── the words ────────────────────────────────────────────────────────────────────────────────────
 
@@ -693,13 +750,39 @@ class _Fine:
 
 
 @dataclass(frozen=True, eq=False)
+class _Misplaced:
+    """Points that belong elsewhere.
+
+    Attributes:
+        code, words: Row of the table and what fills its braces.
+        points: (N, targets, 3) with these points where they belong [m].
+        moved: (N, targets) places that have another point now.
+        rows: Rows that they stand in.
+    """
+
+    code: str
+    points: FloatArray
+    moved: BoolArray
+    rows: tuple[int, ...]
+    words: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
 class _Base:
-    """What an alternative is compared with: linear problem, doubts (N, targets), coefficients, left-out score."""
+    """What an alternative is compared with.
+
+    Attributes:
+        problem, doubt: Linear problem, with the columns of the alternatives before it, and doubts (N, targets).
+        coefficients: (coefficients + columns,) of it.
+        score: Left-out score.
+        there: (K, 3·targets, coefficients + columns) what these move the predictions at the test poses by.
+    """
 
     problem: LinearProblem
     doubt: FloatArray
     coefficients: FloatArray
     score: float
+    there: FloatArray
 
 
 def _order(answer: _Answer) -> tuple[float, float]:
@@ -832,6 +915,72 @@ def _ranges(rows: tuple[int, ...]) -> str:
     return listed([f"{p[0]}–{p[-1]}" if len(p) > 1 else p[0] for p in parts], 5)
 
 
+# ── points that belong elsewhere ─────────────────────────────────────────────────────────────────────
+
+
+def _exchanged_targets(p: FloatArray, predicted: FloatArray, wrong: BoolArray, reach: float) -> _Misplaced | None:
+    """Points of rows where each of the wrong ones fits another target.
+
+    Args:
+        p, predicted: (N, targets, 3) measured, and as the others put them [m].
+        wrong: (N, targets) points that are impossible where they stand.
+        reach: A point this close to another prediction belongs there [m].
+    """
+    points, moved = np.array(p), np.zeros(wrong.shape, bool)
+    for i in np.flatnonzero(wrong.sum(axis=1) > 1).tolist():
+        targets = np.flatnonzero(wrong[i])
+        apart = np.linalg.norm(p[i, targets][:, None] - predicted[i, targets][None], axis=2)
+        to = apart.argmin(axis=1)
+        if apart.min(axis=1).max() < reach and (np.sort(to) == np.arange(len(to))).all():
+            points[i, targets[to]] = p[i, targets]
+            moved[i, targets] = to != np.arange(len(to))
+    if not moved.any():
+        return None
+    rows = tuple(np.flatnonzero(moved.any(axis=1)).tolist())
+    which = listed([t + 1 for t in np.flatnonzero(moved.any(axis=0))], 5)
+    words = {"size": which, "where": f" in {_rows(rows)}"}
+    return _Misplaced("targets", points, moved, rows, words)
+
+
+def _exchanged_rows(p: FloatArray, predicted: FloatArray, wrong: BoolArray, reach: float) -> _Misplaced | None:
+    """Points that fit the joint values of another row; arguments as for ``_exchanged_targets``."""
+    points, moved, seen = np.array(p), np.zeros(wrong.shape, bool), ~np.isnan(p[:, :, 0])
+    to: dict[int, int] = {}
+    for i in np.flatnonzero(wrong.any(axis=1)).tolist():
+        targets = np.flatnonzero(wrong[i])
+        apart = np.linalg.norm(p[i, targets] - predicted[:, targets], axis=2).max(axis=1)
+        apart[i] = np.inf
+        k = int(apart.argmin())
+        if apart[k] < reach:
+            to[i] = k
+            if (seen[k] == seen[i]).all() and wrong[k, targets].all():
+                points[k, targets], moved[k, targets] = p[i, targets], True
+    if not to:
+        return None
+    rows, shifts = tuple(to), [k - i for i, k in to.items()]
+    usual = max(set(shifts), key=shifts.count)
+    text = f"the points of {_rows(rows)} fit the joint values of others"
+    if len(rows) == 2 and to.get(to[rows[0]]) == rows[0]:
+        text = f"the points of rows {rows[0]} and {rows[1]} are exchanged"
+    elif shifts.count(usual) >= max(FEWEST, len(rows) - 2):
+        way = f"{counted(abs(usual), 'row')} further {'down' if usual > 0 else 'up'}"
+        text = f"the points of {_rows(rows)} belong to the joint values {way}"
+    return _Misplaced("rows", points, moved, rows, {"size": text})
+
+
+def _by_chance(misplaced: _Misplaced, predicted: FloatArray, reach: float) -> float:
+    """Probability that points that are wrong anywhere come so close to others, in any row."""
+    n = len(predicted)
+    share = min(1.0, (reach / max(_spread(predicted), reach)) ** 3)
+    others = n if misplaced.code == "rows" else predicted.shape[1]
+    return min(1.0, n * min(1.0, others * share) ** len(misplaced.rows))
+
+
+def _rows(rows: tuple[int, ...]) -> str:
+    """``row 3`` or ``rows 3–7, 12``."""
+    return f"row {rows[0]}" if len(rows) == 1 else f"rows {_ranges(rows)}"
+
+
 # ── gross: what is assumed is so wrong that no fit makes sense ───────────────────────────────────────
 
 GROSS = 0.01
@@ -850,6 +999,8 @@ FAR_APART = 3.0
 """A ratio of spreads beyond which the unit of the points is wrong, whatever else is."""
 WHOLE_TURNS = 4.0 * np.pi
 """Angles beyond this are degrees [rad]."""
+MANY = 0.1
+"""Share of rows with points that belong elsewhere below which a robust fit copes with them by itself."""
 RANK_ROUNDS, FIT_ROUNDS = 3, 8
 """Rounds of weights while changes are ranked, and of a fit of the zeros."""
 MOST_ROWS = 60
@@ -892,12 +1043,13 @@ class _Change:
 
 @dataclass(frozen=True)
 class _Left:
-    """What a change leaves: median distance of a point [m], the scale and the ratio that were fitted."""
+    """What a change leaves: median distance of a point [m], scale and ratio that were fitted, predictions."""
 
     level: float
     scale: float = 1.0
     ratio: float = 1.0
     spare: int = 0
+    points: FloatArray | None = None
 
 
 def explain_gross(robot: Robot, data: Measurements) -> Alternative | None:
@@ -925,7 +1077,7 @@ class _Gross:
         self.base = active.issuperset(BASE_PARAMETERS)
         self.tool = active.issuperset(target_parameters(len(robot.targets)))
         rows = np.flatnonzero(data.seen.any(axis=1))
-        self.robot, self.q, self.p = robot, data.q[rows], data.p[rows]
+        self.robot, self.q, self.p, self.numbers = robot, data.q[rows], data.p[rows], rows
         self.turns = robot.joint_is_revolute
         origin = robot.with_base(np.eye(3), np.zeros(3))
         frame = np.vstack([np.zeros(3), np.eye(3)])
@@ -938,8 +1090,10 @@ class _Gross:
             return None
         plain = self._change("", self.q, self.p)
         before = self._left(plain, fit=True)
-        if before.spare < SPARE or before.level < GROSS * self._extent(self.q):
+        if before.spare < SPARE:
             return None
+        if before.level < GROSS * self._extent(self.q):
+            return self._elsewhere(self._fitted(plain, self.q, self.p, FIT_ROUNDS, True))
         base, after = self._units(plain, before)
         limit = SOUND * self._extent(base.q)
         before = replace(before, level=before.level / base.metre)
@@ -951,6 +1105,39 @@ class _Gross:
         return self._told(
             several if base is plain else [several[0]], before, after, None if base is plain else base
         )
+
+    def _elsewhere(self, before: _Left) -> Alternative | None:
+        """Points of many rows that belong to other rows or targets, beside others that are sound.
+
+        Whether that matters, the fit without them has to say.
+        """
+        assert before.points is not None
+        apart = np.linalg.norm(np.where(np.isnan(self.p), 0.0, self.p - before.points), axis=2)
+        reach = REACH * before.level
+        wrong = apart > max(2.0 * reach, GROSS * self._extent(self.q))
+        if wrong.any(axis=1).mean() < MANY:
+            return None
+        for exchanged in (_exchanged_targets, _exchanged_rows):
+            misplaced = exchanged(self.p, before.points, wrong, reach)
+            if misplaced is None:
+                continue
+            probability = _by_chance(misplaced, before.points, reach)
+            if len(misplaced.rows) >= FEWEST and probability < SIGNIFICANT:
+                rows = tuple(int(i) for i in self.numbers[list(misplaced.rows)])
+                if rows != misplaced.rows:  # rows without points were left out
+                    continue
+                told = _named(misplaced.code, len(rows), "1", misplaced.words, row=rows[0], rows=rows)
+                far = float(np.median(apart[wrong]))
+                return replace(
+                    told,
+                    gain=-float(np.log(max(probability, 1e-300))),
+                    statistic=far / max(before.level, 1e-12),
+                    freedom=len(rows),
+                    probability=probability,
+                    moved=far,
+                    deviations=far / max(before.level, 1e-12),
+                )
+        return None
 
     # ── changes ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -1155,7 +1342,7 @@ class _Gross:
         spare = 3 * int(seen.sum()) - unknown - int(change.scale) - int(change.ratio is not None)
         if spare <= 0:
             return _Left(np.inf)
-        return _Left(level * float(np.sqrt(3 * seen.sum() / spare)), scale, ratio, spare)
+        return _Left(level * float(np.sqrt(3 * seen.sum() / spare)), scale, ratio, spare, points)
 
     def _step(
         self,

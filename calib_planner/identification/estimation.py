@@ -40,6 +40,7 @@ from calib_planner.identification.doubt import (
 )
 from calib_planner.identification.left_out import LeftOut, left_out
 from calib_planner.identification.likelihood import (
+    UNBOUNDED,
     LinearProblem,
     Solution,
     exchange,
@@ -67,10 +68,14 @@ FAR = 30.0
 """Points this many medians away are doubted from the start."""
 BENT = 1e-3
 """Predictions that move by more than this are looked at before the step is taken [m]."""
+SWELLS = 10.0
+"""Scales of visits and points this many times their median are taken for gross errors until that is disproved."""
 MOST_DOUBTS = 8
 """Most rounds in which impossible points come and go."""
 MATERIAL = 3.0
 """A run that is shifted by fewer standard deviations of a point is left alone."""
+COMMON = 2.0
+"""A shift of a run is that many times as large as its visits differ, or it is none."""
 LEAST = 1e-8
 """Predictions that move by less than this stand still [m]."""
 STILL = 1e-3
@@ -225,10 +230,14 @@ class _Work:
         prior = np.sum(problem.standard(coefficients[problem.random] - problem.means) ** 2)
         return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
 
+    def here(self, coefficients: FloatArray) -> Robot:
+        """The robot with the parameters of β (coefficients,)."""
+        names = self.robot.parameter_names
+        return self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
+
     def _poses(self, coefficients: FloatArray) -> Poses:
         """Parameters and deflected joints at β (coefficients,)."""
-        names = self.robot.parameter_names
-        here = self.robot.with_deviations(dict(zip(names, coefficients[: len(names)], strict=True)))
+        here = self.here(coefficients)
         poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
         return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
 
@@ -253,19 +262,34 @@ class _Work:
                 break
         return solution
 
-    def doubt(self, solution: Solution) -> Solution:
-        """Take the weight of what is impossible, and fit again."""
+    def doubt(self, solution: Solution, squares: FloatArray) -> Solution:
+        """Take the weight of what is impossible, and fit again.
+
+        Where many are wrong, it is begun anew as the registration saw them: ``squares`` (N, targets), how far
+        each point was from where the others had put it [m²]. A fit of all points alike may have come to terms
+        with gross errors that are alike.
+        """
         solution = self._without_run(solution)
-        if many_are_wrong(solution, self.state.doubt):
+        if many_are_wrong(solution, self.state.doubt) or self.swollen():
+            model = self.state.model.with_values({s.name: s.median for s in self.state.model.scales})
+            self.state = _State(np.zeros(len(self.state.coefficients)), model, np.maximum(squares, self.shifted))
+            self.settle(MOST_STARTS, 0)
             for _ in range(STUDENT_ROUNDS):
+                solution = self.settle(1, 3)
                 old = self.state.doubt
                 new = np.maximum(student(solution, old), self.shifted)
                 self.state = replace(self.state, doubt=new)
-                solution = self.settle(1, 3)
                 own = np.trace(solution.problem.covariance, axis1=1, axis2=2).min() / new.shape[1]
                 if np.abs(np.log((new + own) / (old + own))).max() < 0.1:
                     break
+            solution = self.settle(1, 3)
         return self.reconsider(solution, MOST_DOUBTS, 30)
+
+    def swollen(self) -> bool:
+        """Whether what is new at visits and points is larger than robots and instruments make it."""
+        model = self.state.model
+        new = {n for term in (model.visits, model.points) if term is not None for n in term.scales}
+        return any(s.value > SWELLS * s.median for s in model.scales if s.name in new and s.factor < UNBOUNDED)
 
     def reconsider(self, solution: Solution, rounds: int, scales: int) -> Solution:
         """Only what is impossible stays doubted; fit again as long as that changes."""
@@ -289,11 +313,13 @@ class _Work:
         doubt[run] = np.where(self.data.seen[run], min(far, LARGEST * own), 0.0)
         self.state = replace(self.state, doubt=np.maximum(doubt, self.state.doubt))
         without = self.settle(MOST_ROUNDS)
-        # The median: one gross point does not make a shift of the visits beside it.
-        shift = np.median(left_out(without).residuals[run][self.data.seen[run]], axis=0)
+        # Medians, and a shift that most share: gross points do not make one of the sound visits between them.
+        apart = left_out(without).residuals[run][self.data.seen[run]]
+        shift = np.median(apart, axis=0)
+        scatter = float(np.median(np.linalg.norm(apart - shift, axis=1)))
         rest = without.problem.covariance[np.setdiff1d(np.arange(len(doubt)), run)]
         std = np.sqrt(np.median(np.trace(rest, axis1=1, axis2=2)) / doubt.shape[1])
-        if np.linalg.norm(shift) > MATERIAL * std:
+        if np.linalg.norm(shift) > max(MATERIAL * std, COMMON * scatter):
             self.shifted = doubt
             return without
         self.state, self.rounds, self.converged = before
@@ -357,8 +383,8 @@ def fit_error_model(
 def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool) -> ModelEstimate:
     """The same for clean arguments."""
     asked = model
-    robot, far = _placed(robot, data)
-    model = _with_gravity_as_stated(model, robot, data)
+    robot, far, squares = _placed(robot, data)
+    model = _with_payload(model, data)
     some = _some(data)
     part = data if some is None else data.select(some)
     work = _Work(robot, part, model)
@@ -367,7 +393,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
     work.settle(MOST_STARTS, 0)
     solution = work.settle(MOST_ROUNDS)
     if robust:
-        solution = work.doubt(solution)
+        solution = work.doubt(solution, squares if some is None else squares[some])
     gains: dict[str, float] = {}
     if choose:
         solution, gains = work.choose_terms(solution)
@@ -422,6 +448,8 @@ def _knowledge(work: _Work, covariance: FloatArray, hidden: FloatArray) -> Knowl
         # What was said of these points is what is expected of others.
         usual = Isotropic(float(np.sqrt(np.mean(np.asarray(data.std)[data.seen] ** 2))))
         told = replace(told, points=replace(told.points, noise=usual))
+    if told.gravity is not None:
+        told = replace(told, gravity=told.gravity.placed(work.here(work.state.coefficients)))
     return Knowledge(work.robot, told, work.state.coefficients, covariance, hidden)
 
 
@@ -485,8 +513,8 @@ def _updated(
 
     That is so if ``start`` is of another robot or model, did not converge or left a direction hidden; if it has
     no terms with scales (the paper's model: a full fit is as quick); if there are ``GROWN`` times as many visits
-    as the scales come from, or most of these went; if the squared left-out residuals changed by a factor of
-    ``OFF``; or if a visit that went was the only one to tell something.
+    as the scales come from, or most of these went; if the first payload came; if the squared left-out residuals
+    changed by a factor of ``OFF``; or if a visit that went was the only one to tell something.
     """
     origin, old = start.origin, start.solution.problem
     placed = old.robot
@@ -496,6 +524,8 @@ def _updated(
         return None
     rows = _common(origin.data, data)
     stays = rows >= 0
+    if _with_payload(old.model, data) is not old.model:
+        return None
     if len(data) > GROWN * origin.visits or stays.sum() < origin.visits / GROWN:
         return None
     work = _Work(placed, data, old.model)
@@ -620,12 +650,12 @@ def _with_doubt(parts: Mapping[str, FloatArray], doubt: FloatArray) -> dict[str,
 # ── the parts of a full fit ──────────────────────────────────────────────────────────────────────────
 
 
-def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
-    """``robot`` with unknown base and targets where they fit the nominal chain best, and D of far points.
+def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray, FloatArray]:
+    """``robot`` with unknown base and targets where they fit the nominal chain best; D of far points; squares.
 
     Each point weighs by how far it is from where the others put it (Cauchy, with the median as scale): some that
     are wrong by metres must not place the tracker. Those ``FAR`` times the median away are doubted from the
-    start.
+    start. The squares are those of the distances, (N, targets) [m²].
     """
     base, tool = _unknown_places(robot)
     weights, seen = data.seen.astype(float), data.seen
@@ -641,18 +671,15 @@ def _placed(robot: Robot, data: Measurements) -> tuple[Robot, FloatArray]:
         settled, weights = np.abs(new - weights).max() < 0.01, new
         if settled:
             break
-    return put, np.where(length > FAR * median, OUT * length**2, 0.0)
+    return put, np.where(length > FAR * median, OUT * length**2, 0.0), length**2
 
 
-def _with_gravity_as_stated(model: ErrorModel, robot: Robot, data: Measurements) -> ErrorModel:
-    """The model whose elastic term knows how the robot is mounted and what it carried, from base and data."""
-    if model.gravity is None:
-        return model
-    gravity = model.gravity.placed(robot)
+def _with_payload(model: ErrorModel, data: Measurements) -> ErrorModel:
+    """The model with a payload at the tip if the data hold one that its elastic term does not know."""
     heaviest = 0.0 if data.payload is None else float(np.asarray(data.payload).max())
-    if heaviest > 0.0 and gravity.payload is None:
-        gravity = gravity.with_payload(Payload(heaviest))
-    return replace(model, gravity=gravity)
+    if model.gravity is None or model.gravity.payload is not None or not heaviest:
+        return model
+    return replace(model, gravity=model.gravity.with_payload(Payload(heaviest)))
 
 
 def _some(data: Measurements) -> FloatArray | None:

@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, check_configurations, check_number
-from calib_planner.error_model import ACCURACIES, ErrorModel, Points, Prior, typical, without_rigid_motion
+from calib_planner.error_model import (
+    ACCURACIES,
+    ErrorModel,
+    Points,
+    Prior,
+    gravity_of,
+    typical,
+    without_rigid_motion,
+)
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
@@ -92,7 +100,7 @@ class IdentificationProblem:
 
     def _model(self) -> ErrorModel:
         """The error model with the noise and the prior that are stated beside it."""
-        model = typical() if self.error_model is None else self.error_model
+        model = typical(gravity=gravity_of(self.robot)) if self.error_model is None else self.error_model
         noise = self.instrument if self.sigma is None else Isotropic(self.sigma)
         if noise is None and self.data.std is not None and model.is_papers:
             noise = Isotropic(float(np.sqrt(np.mean(np.asarray(self.data.std)[self.data.seen] ** 2))))

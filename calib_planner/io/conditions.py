@@ -99,6 +99,19 @@ def read_instrument(path: str | Path) -> Noise:
     return top.build(lambda: LaserTracker(along, growth, azimuth, elevation, station, up))
 
 
+def read_vertical(path: str | Path) -> tuple[float, float, float] | None:
+    """The direction upwards in the frame of the points that an instrument's file states; ``None`` if it does not.
+
+    Raises:
+        FileFormatError: Not readable, or no direction.
+    """
+    top = read_yaml(path, "a YAML file of an instrument")
+    if "up" not in top:
+        return None
+    x, y, z = (float(v) for v in top["up"].numbers(3))
+    return x, y, z
+
+
 def _capsules(top: Node, robot: Robot) -> Capsules:
     if "capsules" not in top:
         return Capsules()

@@ -186,7 +186,8 @@ class Row(NamedTuple):
 class ComparedSet(NamedTuple):
     """Points whose distances are compared: name for people, then places in the report's JSON, empty: it has none.
 
-    ``number`` is their number; ``key`` has mean, rms, max and, if ``predicted``, predicted_rms; ``alone`` the same of placement alone.
+    ``number`` is their number; ``key`` has mean, rms, max and, if ``predicted``, predicted_rms; ``alone`` has
+    mean and rms with placement alone.
     """
 
     name: str

@@ -44,9 +44,10 @@ from calib_planner.demo import (
     print_table,
 )
 from calib_planner.errors import CalibPlannerError, InfeasibleError
+from calib_planner.io import read_estimate
 from calib_planner.planning import PlanProblem
 from calib_planner.robot import Robot
-from calib_planner.ros.messages import estimate_from_message, plan_from_message
+from calib_planner.ros.messages import plan_from_message
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.units import length
@@ -257,18 +258,23 @@ def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> De
             plan = _measure(configurations, seed, client, screen)
             screen.say("saving")
             screen.console.print(client.save())
-            estimate = estimate_from_message(client.estimate)
         finally:
             client.close()
     screen.say("comparing with random plans")
     robot = Robot.load(ROBOT).with_parameters(LEVEL)
     received = plan_from_message(plan).plan
     problem = PlanProblem(robot, [TEST_POSE], configurations, noise=received.sigma)
-    cell = demo_cell(robot, seed, received.sigma)
-    result = demo_report(problem, received, estimate, cell, seed=seed, report=folder)
+    saved = read_estimate(next(iter(sorted(folder.glob("estimate_*.yaml"), key=_modified, reverse=True))))
+    cell, learnt = demo_cell(robot, seed, received.sigma), (saved.knowledge(robot), saved.calibrated(robot))
+    result = demo_report(problem, received, *learnt, cell, seed=seed, report=folder)
     draw(result, folder / "demo.png")
     (folder / "demo.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n")
     return result
+
+
+def _modified(path: Path) -> float:
+    """When a file was written [s]."""
+    return path.stat().st_mtime
 
 
 def _measure(configurations: int, seed: int, client: DemoClient, screen: Screen) -> PlanMessage:
@@ -308,7 +314,7 @@ def main(args: Sequence[str] | None = None) -> int:
         prog="python -m calib_planner.ros.demo",
         description="Calibrate a simulated KUKA KR-270 over ROS 2 and compare with the truth.",
     )
-    parser.add_argument("--configurations", type=int, default=12, help="configurations (default 12)")
+    parser.add_argument("--configurations", type=int, default=30, help="configurations (default 30)")
     parser.add_argument("--seed", type=int, default=0, help="seed of true errors, noise and search")
     parser.add_argument("--output", type=Path, default=Path("calib_planner_demo"), help="folder for files")
     parser.add_argument("--json", action="store_true", help="the result as one JSON object on stdout")

@@ -50,8 +50,8 @@ def test_plan_simulate_identify(call: Any, tmp_path: Path) -> None:
     made = call("simulate", *arguments, "--plan", plan_file, "--error-model", "paper", "--output", data)
     assert made["measurements"] == 12
     result = call(
-        "identify", *arguments, "--data", data, "--sigma", "3e-5", "--output", estimate_file,
-        "--test-pose", " ".join(str(v) for v in np.radians([0, -60, 90, 0, 45, 0])),
+        "identify", *arguments, "--data", data, "--sigma", "3e-5", "--error-model", "paper",
+        "--output", estimate_file, "--test-pose", " ".join(str(v) for v in np.radians([0, -60, 90, 0, 45, 0])),
     )  # fmt: skip
     keys = "parameters rank unidentifiable measurements used rejected sigma_estimate residual_before"
     assert result.keys() >= {*keys.split(), "residual_after", "predicted_accuracy", "status", "seconds"}
@@ -175,15 +175,20 @@ IRB = SHARED_DATA / "irb120_tracker"
 
 
 @pytest.mark.skipif(not IRB.is_dir(), reason="the measured data are not here")
-@pytest.mark.parametrize(("level", "rank", "most"), [("offsets", 19, 0.48e-3), ("full", 33, 0.33e-3)])
+@pytest.mark.parametrize(("level", "rank", "most"), [("offsets", 21, 0.57e-3), ("full", 51, 0.145e-3)])
 def test_irb120(call: Any, level: str, rank: int, most: float) -> None:
-    """ABB IRB 120 before a tracker: 40 poses that took no part in the fit."""
-    result = call(
+    """ABB IRB 120 before a tracker: 40 poses that took no part in the fit, better than by plain least squares.
+
+    The re-seated target is told by one row, and what the model does not say at that row is in all others.
+    """
+    words = (
         "identify", "--robot", str(IRB / "irb120.urdf"), "--data", str(IRB / "calibration.csv"),
         "--parameters", level, "--unknown", "base,tool", "--validate", str(IRB / "test_1.csv"),
         "--validate", str(IRB / "test_2.csv"), "--validate-target-from", "1", "--json",
     )  # fmt: skip
+    result, plain = call(*words), call(*words, "--error-model", "paper")
     assert result["rank"] == rank
+    assert result["validation"]["rms"] < plain["validation"]["rms"]
     assert result["validation"]["count"] == 40
     assert result["validation"]["before_mean"] == pytest.approx(4.9e-3, abs=0.1e-3)
     assert result["validation"]["mean"] <= most
@@ -206,8 +211,8 @@ def test_ur10(call: Any, tmp_path: Path) -> None:
     )  # fmt: skip
     assert result["validation"]["count"] == 800
     assert result["validation"]["before_mean"] == pytest.approx(0.91e-3, rel=0.1)
-    assert result["validation"]["geometry_mean"] == pytest.approx(0.50e-3, rel=0.1)
-    assert result["validation"]["mean"] <= 0.30e-3  # with joint corrections
+    assert result["validation"]["placement_mean"] == pytest.approx(0.50e-3, rel=0.1)
+    assert result["validation"]["mean"] <= 0.30e-3  # with gravity and joint functions
 
 
 # ── sizes, criteria and the baseline ─────────────────────────────────────────────────────────────────

@@ -164,6 +164,9 @@ def spoil(how: str, points: FloatArray, rng: np.random.Generator) -> NDArray[np.
     if how == "random":
         bad.ravel()[rng.choice(80, 24, replace=False)] = True
         points[:40][bad] += rng.uniform(-0.05, 0.05, (24, 3))
+    elif how == "alike":
+        bad.ravel()[rng.choice(80, 24, replace=False)] = True
+        points[:40][bad] += np.array([0.01, 0.004, -0.006]) + rng.normal(0.0, 1e-3, (24, 3))
     elif how == "block":
         bad[10:22] = True
         points[10:22] += [0.01, -0.005, 0.008]
@@ -174,7 +177,7 @@ def spoil(how: str, points: FloatArray, rng: np.random.Generator) -> NDArray[np.
     return bad
 
 
-@pytest.mark.parametrize("how", ["random", "block", "swapped targets"])
+@pytest.mark.parametrize("how", ["random", "alike", "block", "swapped targets"])
 @pytest.mark.parametrize("scales", [{}, ALL], ids=["noise", "all"])
 def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> None:
     robot = ur10e(2)
@@ -185,7 +188,7 @@ def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> N
     found = fit_error_model(unknown(robot), Measurements(robot.joint_names, data.q[:40], points[:40]), typical())
     assert ((found.doubt > 0) == bad).all()
     (good, _), (distance, ratio) = fresh_errors(clean, data, 40), fresh_errors(found, data, 40)
-    assert distance.mean() < 1.3 * good.mean()
+    assert distance.mean() < 1.2 * good.mean()
     assert 0.75 < ratio < 1.4
 
 

@@ -13,8 +13,7 @@ from robots import SHARED_DATA, repeats
 
 from calib_planner import Measurements, Robot
 from calib_planner.arrays import FloatArray
-from calib_planner.error_model import ErrorModel, Knowledge
-from calib_planner.error_model.typical import typical
+from calib_planner.error_model import ErrorModel, Knowledge, Placement, Prior, typical
 from calib_planner.identification.alternatives import (
     SIGNIFICANT,
     TABLE,
@@ -361,6 +360,53 @@ def test_too_few_points_tell_nothing() -> None:
     one = cell(0, 1, 40)
     few = one.data().select(np.arange(2))
     assert explain_gross(one.asked, few) is None
+
+
+# ── points that belong elsewhere ─────────────────────────────────────────────────────────────────────
+
+
+def test_two_exchanged_rows_are_named() -> None:
+    one = cell(0, 1, 40)
+    data = one.data()
+    points = np.array(data.p)
+    points[[4, 17]] = points[[17, 4]]
+    spoilt = Measurements(data.joint_names, data.q, points)
+    assert explain_gross(one.asked, spoilt) is None  # the fit copes with two
+    (told, *others) = findings(one, spoilt)
+    assert told.code == "rows" and told.rows == (4, 17) and "exchanged" in told.text and not others
+    assert told.gain > 0.0 and not told.material
+
+
+def test_targets_exchanged_in_some_rows_are_named() -> None:
+    one = cell(0, 2, 40)
+    data = one.data()
+    points = np.array(data.p)
+    points[[5, 6, 30]] = points[[5, 6, 30]][:, ::-1]
+    (told, *others) = findings(one, Measurements(data.joint_names, data.q, points))
+    assert told.code == "targets" and told.rows == (5, 6, 30) and not others
+
+
+def test_a_quarter_of_the_rows_one_row_off_is_named() -> None:
+    one = cell(0, 1, 40)
+    data = one.data()
+    points = np.array(data.p)
+    points[10:19], points[19] = data.p[11:20], data.p[10]
+    told = explain_gross(one.asked, Measurements(data.joint_names, data.q, points))
+    assert told is not None and told.code == "rows" and told.rows == tuple(range(10, 20))
+    assert "1 row further down" in told.text and not told.material
+
+
+def test_a_prior_that_is_too_narrow_is_named() -> None:
+    one = cell(0, 1, 40)
+    chain = [p for p in one.asked.parameters if not p.name.startswith(("base.", "target_"))]
+    stated = Prior(tuple(p.name for p in chain), np.array([p.nominal for p in chain]), np.full(len(chain), 5e-5))
+    data = one.data()
+    fit = fitted(one, data, typical(placement=Placement(stated=stated)))
+    told = find_alternatives(one.asked, data, fit, one.poses)
+    (first,) = [t for t in told if t.code == "prior"][:1]
+    assert (
+        "widen the prior" in first.advice and first.parameter in one.asked.parameter_names and first.size >= 1.0
+    )
 
 
 # ── measured robots ──────────────────────────────────────────────────────────────────────────────────

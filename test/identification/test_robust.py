@@ -17,10 +17,10 @@ from calib_planner.units import length
 
 NOISE = {"known": {"sigma": SIGMA}, "unknown": {}}
 CELLS = {
-    "kuka": (plain_cell, 40, repeats(6, 12)),
+    "kuka": (plain_cell, 40, repeats(3, 12)),
     "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, repeats(4, 6)),
-    "full base tool": (placed_cell, 50, repeats(2, 4)),
-    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, repeats(2, 4)),
+    "full base tool": (placed_cell, 50, repeats(1, 4)),
+    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, repeats(1, 4)),
 }
 
 
@@ -66,17 +66,17 @@ def test_bad_points_are_listed_and_the_rest_is_fitted_as_if_they_were_known(name
 @pytest.mark.parametrize("noise", NOISE)
 def test_clean_sets_lose_no_point(noise):
     """The gate promises one set in a hundred."""
-    lost = 0
-    for seed in range(40):
+    lost, seeds = 0, repeats(20, 40)
+    for seed in range(seeds):
         cell, robot = plain_cell(seed)
         data = bare(cell.measure(random_configurations(robot, 20, seed), 1, seed))
         problem = IdentificationProblem(robot, data, loss="robust", **NOISE[noise])
         lost += bool(identify(problem).points.rejected)
-    assert lost <= binom.isf(1e-4, 40, 0.01)
+    assert lost <= binom.isf(1e-4, seeds, 0.01)
 
 
 @pytest.mark.parametrize("noise", NOISE)
-@pytest.mark.parametrize("share", [0.1, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.4])
 def test_up_to_two_fifths_of_gross_errors_are_found(share, noise):
     for make, count in ((plain_cell, 60), (placed_cell, 40)):
         cell, robot = make(3)

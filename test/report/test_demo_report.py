@@ -26,8 +26,14 @@ def result() -> DemoResult:
     data = cell.measure(made.configurations, 1, 2)
     estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
     with pytest.raises(InputError, match="estimate"):
-        demo_report(PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6), made, estimate.fit, cell)
-    return demo_report(problem, made, estimate.fit, cell, report="here")
+        demo_report(
+            PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6),
+            made,
+            estimate.knowledge,
+            estimate.calibrated,
+            cell,
+        )
+    return demo_report(problem, made, estimate.knowledge, estimate.calibrated, cell, report="here")
 
 
 def test_numbers(result: DemoResult) -> None:
@@ -38,7 +44,14 @@ def test_numbers(result: DemoResult) -> None:
 
 
 def test_keys(result: DemoResult) -> None:
-    keys = {"before", "after", "predicted_accuracy", "random_after", "random_predicted_accuracy"}
+    keys = {
+        "before",
+        "after",
+        "placement_alone",
+        "predicted_accuracy",
+        "random_after",
+        "random_predicted_accuracy",
+    }
     found = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert keys | {"parameters", "report"} <= set(found)
     assert {"name", "unit", "true", "value", "std"} <= set(found["parameters"][0])
