@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -32,11 +33,12 @@ from calib_planner.cli.arguments import (
 )
 from calib_planner.cli.sheet import tell_sheet
 from calib_planner.cli.terminal import Terminal, configurations_table
-from calib_planner.error_model import ACCURACIES, typical_prior
+from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, gravity_of, typical_prior
 from calib_planner.errors import InputError
 from calib_planner.io import (
     make_folder,
     read_configurations,
+    read_error_model,
     read_measurements,
     read_prior,
     robot_pace,
@@ -45,9 +47,10 @@ from calib_planner.io import (
 )
 from calib_planner.planning import (
     CRITERIA,
+    GENERAL_SHARE,
+    PAPERS_SHARE,
     POSE_CRITERIA,
     Candidates,
-    ModelDiscrepancy,
     Plan,
     PlanPrior,
     PlanProblem,
@@ -57,12 +60,15 @@ from calib_planner.planning import (
     plan_for_accuracy,
     plan_sheet,
     split_budget,
-    usual_discrepancy,
+    usual_error_model,
+    with_wide_placement,
 )
 from calib_planner.planning import plan as find_plan
 from calib_planner.robot import Robot
+from calib_planner.tracker import Isotropic, Noise
 from calib_planner.units import length
 
+PAPER = "paper"
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
       --configurations 4 --repetitions 3 --output plan.yaml
   calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --accuracy 0.02e-3"""
@@ -162,8 +168,6 @@ def _write(output: str, plan: Plan) -> None:
 
 # ── the arguments that make a plan problem, shared by ``plan`` and ``compare`` ─────────────────────────
 
-USUAL = Search()
-
 
 def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argparse._ArgumentGroup:
     """Add the arguments; returns the group about what may be measured, for the sizes."""
@@ -180,6 +184,9 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
         _add_criteria(wanted)
     work = parser.add_argument_group("what may be measured")
     add_conditions(work)
+    text = "how the robot errs: paper (noise alone), typical (gravity, joint functions and repeatability too) "
+    text += "or YAML, also an estimate, which teaches its scales (paper for the paper's robots, else typical)"
+    option(work, "--error-model", "E", text)
     text = "error of one coordinate that repeating a configuration does not average away [m]"
     option(work, "--configuration-sigma", "S", text, 0.0)
     known = parser.add_argument_group("what is known beforehand")
@@ -189,8 +196,9 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     option(known, "--measured", "FILE", "CSV of measurements already taken: plan the next ones")
     search = parser.add_argument_group("search")
     text = "share of the criterion for accuracy everywhere, 0 … 1; 0 is the paper's"
-    option(search, "--general-weight", "W", text, USUAL.general_weight)
-    option(search, "--starts", "N", "number of random starts", USUAL.starts)
+    text += f" ({PAPERS_SHARE:g}; {GENERAL_SHARE:g} with a whole error model)"
+    option(search, "--general-weight", "W", text, kind=float)
+    option(search, "--starts", "N", "number of random starts (48; 8 with a whole error model)", kind=int)
     option(search, "--time-limit", "S", "time after which the search ends [s]", float("inf"))
     add_seed(search)
     return work
@@ -202,8 +210,7 @@ def _add_criteria(group: Group) -> None:
     text = "mix in the efficiency by another criterion with this share (below 1); repeat for several"
     group.add_argument("--compound", action="append", default=[], metavar="NAME=SHARE", help=text)
     option(group, "--candidates", "FILE", "CSV of joint configurations to choose from, one per row")
-    text = "expect the systematic errors of a real robot when choosing candidates; auto: for robots from a URDF; "
-    text += "off: only the paper's white noise"
+    text = "older word for --error-model: on is typical, off is paper"
     option(group, "--discrepancy", None, text, "auto", choices=("auto", "on", "off"))
     switch(group, "--repeat-candidates", "a candidate may be chosen more than once")
 
@@ -219,23 +226,27 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
     if criterion in POSE_CRITERIA:
         require_test_poses(robot, poses)
     candidates, compound = _candidates(args, robot), _compound(getattr(args, "compound", []))
-    wanted = getattr(args, "discrepancy", "off")
-    discrepancy = ModelDiscrepancy() if wanted == "on" else None
-    if wanted == "auto":
-        discrepancy = usual_discrepancy(robot, criterion, candidates, compound)
+    around = conditions(args, robot)
+    prior = _prior(args.prior, robot)
+    model = _error_model(args, robot, around["noise"])
+    std: dict[str, float] = {}
+    if prior is not None and model.is_papers:
+        std = _independent(args.prior, prior)
+    elif prior is not None:
+        model = replace(model, placement=replace(model.placement, stated=prior))
     return PlanProblem(
         robot=robot,
         test_poses=poses,
         configurations=configurations,
         repetitions=repetitions,
         weights=args.weights,
-        **conditions(args, robot),
+        **around,
         criterion=criterion,
         accuracy_frame=args.accuracy_frame,
         compound=compound,
         repeatability=args.configuration_sigma,
-        discrepancy=discrepancy,
-        prior=PlanPrior(std=_prior(args.prior, robot), measured=_measured(args, robot)),
+        error_model=model,
+        prior=PlanPrior(std=std, measured=_measured(args, robot)),
         search=Search(
             general_weight=args.general_weight, starts=args.starts, seed=args.seed, time_limit=args.time_limit
         ),
@@ -254,12 +265,28 @@ def _compound(words: list[str]) -> dict[str, float]:
     return shares
 
 
-def _prior(given: str | None, robot: Robot) -> dict[str, float]:
+def _error_model(args: argparse.Namespace, robot: Robot, noise: Noise | float) -> ErrorModel:
+    older = {"on": TYPICAL, "off": PAPER}.get(getattr(args, "discrepancy", "auto"))
+    if older and args.error_model not in (None, older):
+        raise InputError("--discrepancy", args.discrepancy, f"--error-model {args.error_model} alone")
+    wanted = args.error_model or older
+    if wanted is None:
+        return usual_error_model(robot, noise)
+    instrument = Isotropic(noise) if isinstance(noise, (float, int)) else noise
+    model = read_error_model(wanted, instrument)
+    if wanted != TYPICAL:
+        return model
+    return with_wide_placement(replace(model, gravity=gravity_of(robot)))
+
+
+def _prior(given: str | None, robot: Robot) -> Prior | None:
     if given is None:
-        return {}
-    prior = typical_prior(robot) if given == TYPICAL else read_prior(given, robot).prior
-    if prior is None:
-        return {}
+        return None
+    return typical_prior(robot) if given == TYPICAL else read_prior(given, robot).prior
+
+
+def _independent(given: str, prior: Prior) -> dict[str, float]:
+    """Parameter → standard deviation [m | rad] of a prior, for the paper's model."""
     covariance = np.asarray(prior.covariance)
     variances = np.diag(covariance)
     if (covariance != np.diag(variances)).any():

@@ -31,7 +31,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner.arrays import FloatArray, check_array, check_number
+from calib_planner.arrays import FloatArray, IntArray, check_array, check_number
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot import Element, Robot, lumped, target_elements
@@ -150,14 +150,12 @@ class Gravity:
 
     def columns(self, poses: Poses) -> FloatArray:
         """(N, 3·targets, K) c_l τ_lm [m per rad/m]."""
-        joints = [j for _, j in self._pairs(poses.robot)]
-        return np.asarray(poses.levers[:, :, joints] * self._moments(poses)[:, None, :])
+        return np.asarray(poses.levers[:, :, self.joints(poses.robot)] * self.moments(poses)[:, None, :])
 
     def deflection(self, poses: Poses, coefficients: FloatArray) -> FloatArray:
         """(N, joints) δ for coefficients (K,), in units of ``joint_units``."""
         result = np.zeros(poses.q.shape)
-        joints = np.array([j for _, j in self._pairs(poses.robot)], int)
-        np.add.at(result.T, joints, (self._moments(poses) * coefficients).T)
+        np.add.at(result.T, self.joints(poses.robot), (self.moments(poses) * coefficients).T)
         return result
 
     def variances(self, robot: Robot, values: dict[str, float]) -> FloatArray:
@@ -176,15 +174,60 @@ class Gravity:
             last[part.name] = max(at, last.get(part.name, -1))
         return [(mass, j) for mass, end in last.items() for j in range(end + 1)]
 
-    def _moments(self, poses: Poses) -> FloatArray:
+    def joints(self, robot: Robot) -> IntArray:
+        """(K,) the joint of every coefficient."""
+        return np.array([j for _, j in self._pairs(robot)], np.int64)
+
+    def moment_gradients(self, poses: Poses) -> FloatArray:
+        """(N, K, joints) ∂τ/∂q [m/rad | m/m].
+
+        A joint k in front of joint l turns its moment as a whole; one behind it moves the mass alone:
+
+            ∂τ_lm/∂q_k = (w_k × (w_l × (p_m − o_l))) · d     for k ≤ l ,
+                         (w_l × (w_k × (p_m − o_k))) · d     for k > l ,
+
+        where both turn. A sliding k ≤ l carries joint and mass along and changes nothing, behind l it moves the
+        mass by w_k; the force w_l · d along a sliding l changes as w_l is turned.
+        """
+        robot, posture = poses.robot, poses.posture
+        down = robot.base_pose[0] @ self.down
+        turns, joints = robot.joint_is_revolute, len(robot.joint_names)
+        axes, order = posture.joint_axes, np.arange(joints)
+        sideways = _cross(down[None, None], axes).transpose(0, 2, 1)  # d × w_k, (N, 3, joints)
+        in_front = order[None, :] <= order[:, None]  # k ≤ l, as [l, k]
+        total: dict[str, FloatArray] = {}
+        for part in self.masses_of(robot):
+            arm = self._arms(poses, part)
+            lever = np.where(
+                turns[:, None], _cross(axes, arm), axes
+            )  # how the mass moves with joint k; τ = lever · d
+            whole = lever @ sideways * turns  # (w_k × lever_l) · d = lever_l · (d × w_k)
+            alone = sideways.transpose(0, 2, 1) @ np.swapaxes(lever, 1, 2) * turns[:, None]
+            rate = np.where(in_front, whole, alone) * part.weight
+            if part.joint is not None:
+                rate[:, part.joint + 1 :] = 0.0
+                rate[:, :, part.joint + 1 :] = 0.0
+            if part.name == PAYLOAD and poses.payload is not None and self.payload is not None:
+                rate *= poses.payload[:, None, None] / self.payload.mass
+            total[part.name] = total.get(part.name, np.zeros((len(poses), joints, joints))) + rate
+        return np.stack([total[mass][:, j] for mass, j in self._pairs(robot)], axis=1)
+
+    def _arms(self, poses: Poses, part: Mass) -> FloatArray:
+        """(N, joints, 3) from every joint to a part of a mass [m]; kept with the poses."""
+        key = ("arm", part)
+        if key not in poses.cache:
+            points = link_points(poses.robot, poses.q, part.joint, part.xyz)
+            poses.cache[key] = points[:, None, :] - poses.posture.joint_origins
+        return poses.cache[key]
+
+    def moments(self, poses: Poses) -> FloatArray:
         """(N, K) τ [m], or the force along a sliding joint, of a unit weight."""
         robot, posture = poses.robot, poses.posture
         down = robot.base_pose[0] @ self.placed(robot).down
         turns, joints = robot.joint_is_revolute, len(robot.joint_names)
         total: dict[str, FloatArray] = {}
         for part in self.masses_of(robot):
-            arm = link_points(robot, poses.q, part.joint, part.xyz)[:, None, :] - posture.joint_origins
-            turning = np.cross(posture.joint_axes, arm) @ down
+            turning = _cross(posture.joint_axes, self._arms(poses, part)) @ down
             felt = np.where(turns, turning, posture.joint_axes @ down) * part.weight
             if part.joint is not None:
                 felt[:, part.joint + 1 :] = 0.0
@@ -192,6 +235,14 @@ class Gravity:
                 felt *= poses.payload[:, None] / self.payload.mass
             total[part.name] = total.get(part.name, np.zeros((len(poses), joints))) + felt
         return np.stack([total[mass][:, j] for mass, j in self._pairs(robot)], axis=1)
+
+
+def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Cross product over the last axis; ``np.cross`` takes three times as long for few of them."""
+    x = u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1]
+    y = u[..., 2] * v[..., 0] - u[..., 0] * v[..., 2]
+    z = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return np.stack([x, y, z], axis=-1)
 
 
 def gravity_of(robot: Robot) -> Gravity:

@@ -38,6 +38,11 @@ class Poses:
     def __len__(self) -> int:
         return len(self.q)
 
+    @cached_property
+    def cache(self) -> dict[object, FloatArray]:
+        """What a term computes of these poses and needs again."""
+        return {}
+
     @property
     def actual(self) -> FloatArray:
         """(N, joints) where the joints stand [rad | m]."""

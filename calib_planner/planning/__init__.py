@@ -18,7 +18,6 @@ from calib_planner.planning.constraints import (
 )
 from calib_planner.planning.constraints.self_collision import SelfCollision
 from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA, Determinant
-from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.feasibility import Constraint, Feasibility
 from calib_planner.planning.information import (
     InformationModel,
@@ -27,14 +26,17 @@ from calib_planner.planning.information import (
 )
 from calib_planner.planning.planner import Callback, Progress, plan
 from calib_planner.planning.problem import (
+    GENERAL_SHARE,
+    PAPERS_SHARE,
     Candidates,
     PlanPrior,
     PlanProblem,
     Search,
-    usual_discrepancy,
+    usual_error_model,
+    with_wide_placement,
 )
 from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
-from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlanQuality
+from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
 from calib_planner.planning.tour import DWELL, PEAK, Pace, timetable, usual_pace, visiting_order

@@ -33,8 +33,9 @@ import numpy as np
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning.criteria import Criterion
+from calib_planner.planning.extended import ExtendedModel, LinearisedExtension
 from calib_planner.planning.feasibility import Feasibility
-from calib_planner.planning.information import InformationModel
+from calib_planner.planning.information import Model
 from calib_planner.planning.search.descent import Descent, climb, descend
 
 SPREAD = 256
@@ -58,7 +59,7 @@ class DesignProblem:
         distinct: m if every candidate may be chosen once only, else ``None``.
     """
 
-    model: InformationModel
+    model: Model
     criterion: Criterion
     prior: FloatArray
     measurements: int
@@ -106,6 +107,8 @@ def approximate_design(
         gap: Relative.
     """
     model, n = problem.model, problem.measurements
+    if isinstance(model, ExtendedModel):
+        return _extended_design(problem, model, start, rng, cancel)
     if problem.candidates is not None:
         q = problem.candidates[problem.feasibility.mask(problem.candidates)]
         if not len(q):
@@ -175,7 +178,7 @@ def _probes(
     """Starts for the maximisation of d: the support, and the best of many random configurations."""
     known = support[np.argsort(-weights)[:10]]
     random = problem.feasibility.sample(rng, 512)
-    height = np.einsum("nab,ab->n", problem.model.at(random), gradient)
+    height = _heights(problem.model, gradient, random)
     return np.concatenate([known, random[np.argsort(-height)[:14]]])
 
 
@@ -191,6 +194,8 @@ def maximise_sensitivity(problem: DesignProblem, gradient: FloatArray, starts: F
         value = np.where(problem.feasibility.mask(q), -np.log(d), np.inf) if constrained else -np.log(d)
         return value, info.gradient(-gradient / d[:, None, None])
 
+    if isinstance(problem.model, ExtendedModel):
+        return descend(objective, starts, low, high, iterations=20, tolerance=1e-3)
     return descend(objective, starts, low, high, iterations=40, tolerance=1e-4)
 
 
@@ -238,6 +243,109 @@ def _reweighted(
         else:
             break
     return w, matrix
+
+
+# ── with a whole error model ─────────────────────────────────────────────────────────────────────────────
+
+ROUNDS, UPDATES = 6, 10
+"""Most rounds, and updates of the weights in each. A round costs some matrices of the size of the support."""
+LARGEST_SUPPORT = 60
+"""Configurations that may have weight at the end of a round."""
+CLOSE_ENOUGH = 1e-2
+"""Relative gap at which the rounds end; ρ0 has half of it."""
+
+
+def _heights(model: Model, gradient: FloatArray, q: FloatArray) -> FloatArray:
+    """d(q) = tr(G I_1(q)) at ``q`` (N, joints): (N,)."""
+    if isinstance(model, ExtendedModel):
+        rows = model.whitened(q)
+        return np.asarray(np.sum((rows @ gradient) * rows, axis=(1, 2)))
+    return np.asarray(np.einsum("nab,ab->n", model.at(q), gradient))
+
+
+def _extended_design(
+    problem: DesignProblem,
+    model: ExtendedModel,
+    start: FloatArray,
+    rng: np.random.Generator,
+    cancel: Callable[[], bool],
+) -> ApproximateDesign:
+    """The same as ``approximate_design`` with (2) of ``extended``: heights are those of the model seen from the
+    design, and M₀ has Σ_l Θ_lᵀΘ_l beside it."""
+    n, feasibility = problem.measurements, problem.feasibility
+    candidates = problem.candidates
+    if candidates is not None:
+        candidates = candidates[feasibility.mask(candidates)]
+        if not len(candidates):
+            raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
+        drawn = candidates[rng.permutation(len(candidates))]
+    else:
+        drawn = np.concatenate([start, feasibility.sample(rng, SPREAD)])
+    everywhere = model.at(drawn[-SPREAD:]).mean(axis=0)
+    support: FloatArray = drawn[:LARGEST_SUPPORT]
+    weights: FloatArray = np.full(len(support), 1.0 / len(support))
+    best: ApproximateDesign | None = None
+    for step in range(ROUNDS):
+        floor = max(FIRST_FLOOR * 0.5**step, LAST_FLOOR)
+        ground = problem.prior + n * floor * everywhere
+        mass = n * (1.0 - floor)
+        weights, matrix, seen, extra = _reweighted_together(
+            problem.criterion, model.linearised(support), weights, mass, ground
+        )
+        gradient = problem.criterion.supporting_gradient(matrix)
+        lifted = replace(problem, model=seen.model)
+        if candidates is not None:
+            where, heights = candidates, _heights(seen.model, gradient, candidates)
+        else:
+            peaks = maximise_sensitivity(lifted, gradient, _probes(lifted, gradient, support, weights, rng))
+            where, heights = peaks.x, np.exp(-peaks.value)
+        value, distinct = problem.criterion.exact(matrix), problem.distinct
+        top = float(np.mean(np.sort(heights)[-distinct:])) if distinct else float(heights.max())
+        ceiling = float(np.sum(gradient * (problem.prior + extra))) + n * top
+        best = _better(best, ApproximateDesign(value, max(ceiling, value), weights, gradient, support))
+        if best.value >= (1.0 - CLOSE_ENOUGH) * best.bound or cancel():
+            break
+        new = where[np.argsort(-heights, kind="stable")[:6]]
+        strong = np.argsort(-weights)[: LARGEST_SUPPORT - len(new)]
+        support = np.concatenate([support[strong], new])
+        weights = np.concatenate([weights[strong], np.full(len(new), 0.02 / len(new))])
+        weights /= weights.sum()
+    assert best is not None
+    if candidates is not None:
+        shares = np.array([best.weights[(best.support == row).all(axis=1)].sum() for row in candidates])
+        return replace(best, weights=shares / shares.sum(), support=candidates)
+    return best
+
+
+def _reweighted_together(
+    criterion: Criterion, info: LinearisedExtension, w: FloatArray, mass: float, ground: FloatArray
+) -> tuple[FloatArray, FloatArray, LinearisedExtension, FloatArray]:
+    """Improve the weights w (K,) of the configurations of ``info``, which share what no coefficient holds.
+
+    There are ``mass`` measurements in all, and M is ``ground`` (p, p) without them.
+
+    Returns:
+        The weights, M (p, p), the configurations in the model seen from there, and Σ_l Θ_lᵀΘ_l (p, p).
+    """
+
+    def at(w: FloatArray) -> tuple[float, FloatArray, FloatArray, LinearisedExtension, FloatArray]:
+        seen, extra = info.seen_from(mass * np.maximum(w, 1e-9))
+        rows = seen.whitened
+        matrix = ground + extra + mass * np.tensordot(rows * w[:, None, None], rows, axes=([0, 1], [0, 1]))
+        psi, gradient = (part[0] for part in criterion.value_and_gradient(matrix[None]))
+        heights = np.maximum(np.sum((rows @ gradient) * rows, axis=(1, 2)), 1e-300)
+        return float(psi), matrix, heights, seen, extra
+
+    psi, matrix, heights, seen, extra = at(w)
+    exponent = 0.7
+    for _ in range(UPDATES):
+        trial = _normalised(w * (heights / (w @ heights)) ** exponent)
+        moved = at(trial)
+        if moved[0] >= psi * (1.0 - 1e-12):
+            w, (psi, matrix, heights, seen, extra) = trial, moved
+        else:
+            exponent *= 0.5
+    return w, matrix, seen, extra
 
 
 # ── among candidates ─────────────────────────────────────────────────────────────────────────────────

@@ -70,7 +70,7 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
         if candidate is None:
             continue
         tried.append(candidate)
-        if not fewest and problem.repeatability == 0 and problem.prior.empty:
+        if not fewest and problem.repeatability == 0 and problem.prior.empty and problem.whole_model is None:
             needed = candidate.measurements * (candidate.quality.value_bound / accuracy) ** 2
             fewest = int(np.ceil(needed * (1 - 1e-9)))
         if best is None or candidate.measurements < best.measurements:

@@ -37,6 +37,7 @@ from calib_planner.planning.criteria import (
     accuracy_weights,
     make_criterion,
 )
+from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.robot import Identifiability, Linearisation, Robot, analyse, is_nuisance
@@ -65,6 +66,15 @@ class InformationModel:
         jacobian = np.ascontiguousarray(jacobian)
         return np.swapaxes(jacobian, 1, 2) @ self._weigh(points, jacobian)
 
+    def columns(self, q: FloatArray) -> FloatArray:
+        """J (N, 3·targets, p) at ``q`` (N, joints)."""
+        return self.robot.jacobian(q)
+
+    def totals(self, q: FloatArray, size: int) -> FloatArray:
+        """Σ I of each run of ``size`` configurations of ``q`` (N, joints): (N/size, p, p)."""
+        each = self.at(q)
+        return each.reshape(-1, size, *each.shape[1:]).sum(axis=1)
+
     def whitened(self, q: FloatArray) -> FloatArray:
         """Rows W^½ J with I(q) = rowsᵀ rows: (N, joints) → (N, 3·targets, p)."""
         points, jacobian = self.robot.positions_and_jacobian(q)
@@ -92,6 +102,10 @@ class InformationModel:
     def _covariance(self, points: FloatArray) -> FloatArray:
         common = self.repeatability**2 * np.eye(3)
         return self.noise.covariance(points) / self.repetitions + common
+
+
+Model = InformationModel | ExtendedModel
+"""How configurations turn into information: by the paper, or by a whole error model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +156,9 @@ SAMPLE = 512
 
 @dataclass(frozen=True, eq=False)
 class PlanSpace:
-    """The problem in parameters that some plan can tell apart; p of them, q of interest.
+    """The problem in the coefficients that some plan can tell apart: p of them, q of interest.
+
+    With an error model, those of gravity and of joint functions follow the parameters.
 
     Attributes:
         problem: The request.
@@ -154,23 +170,25 @@ class PlanSpace:
         prior: (p, p) M_0.
         feasibility: The constraints.
         test_jacobians: (K, 3·targets, p) rows of (M3) at the test poses, base and target columns included.
+        test_floor: (K,) part of ρ0² at a test pose that no coefficient holds [m²]; 0 for few test poses.
         blind: (K,) whether a test pose feels what no configuration shows.
         general: (p, p) mean accuracy weight over the workspace, of the same rows.
-        sample: (p, p) mean information of one measurement over the workspace.
+        general_floor: Mean of what no coefficient holds over the workspace [m²].
     """
 
     problem: PlanProblem
     robot: Robot
     identifiability: Identifiability
     interest: tuple[int, ...]
-    model: InformationModel
-    single: InformationModel
+    model: Model
+    single: Model
     prior: FloatArray
     feasibility: Feasibility
     test_jacobians: FloatArray
+    test_floor: FloatArray
     blind: NDArray[np.bool_]
     general: FloatArray
-    sample: FloatArray
+    general_floor: float
 
     def criterion(self, name: str) -> Criterion:
         """The criterion of that name over the p parameters.
@@ -181,7 +199,7 @@ class PlanSpace:
         """
         if name in POSE_CRITERIA:
             tests = accuracy_weights(self.test_jacobians)
-            return make_criterion(name, len(self.robot.parameter_names), tests, self.problem.weight_array)
+            return make_criterion(name, len(self.prior), tests, self.problem.weight_array)
         made = make_criterion(name, len(self.interest), np.empty(0), np.ones(1))
         if not self.nuisance:
             return made
@@ -189,12 +207,12 @@ class PlanSpace:
 
     @property
     def nuisance(self) -> tuple[int, ...]:
-        """Indices of the parameters of base and targets."""
-        return tuple(i for i in range(len(self.robot.parameter_names)) if i not in self.interest)
+        """Indices of the coefficients that are not of interest: of base, targets and the other terms."""
+        return tuple(i for i in range(len(self.prior)) if i not in self.interest)
 
     def search_criterion(self) -> Criterion:
         """What the search maximises: the criterion wanted, with a share for accuracy elsewhere."""
-        share = self.problem.search.general_weight
+        share = self.problem.general_weight
         plain = self.criterion(self.problem.criterion)
         if self.problem.criterion != "test_pose" or not isinstance(plain, Accuracy) or share == 0:
             return plain
@@ -212,7 +230,8 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     feasibility = Feasibility(problem.robot, problem.constraints)
     q = _representative(problem, feasibility)
     jacobians = np.ascontiguousarray(problem.robot.jacobian(q))
-    prior_rows = _prior_rows(problem)
+    stated_rows, measured_rows = _stated_rows(problem), _measured_rows(problem)
+    prior_rows = np.concatenate([stated_rows, measured_rows])
     stacked = np.concatenate([jacobians.reshape(-1, len(names)), prior_rows * problem.instrument.typical])
     identifiable = analyse(stacked, names)
     free = sorted(identifiable.free)
@@ -228,30 +247,79 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     interest = tuple(i for i, n in enumerate(robot.parameter_names) if not is_nuisance(n)) or tuple(
         range(len(free))
     )
-    poses = problem.test_pose_array
-    tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(free)))
+    model, single = (_model(problem, robot, r) for r in (problem.repetitions, 1))
+    known = prior[np.ix_(free, free)]
+    if isinstance(single, ExtendedModel):
+        stated = (stated_rows.T @ stated_rows)[np.ix_(free, free)]
+        known = _with_other_terms(problem, single, stated)
+    poses, frame = problem.test_pose_array, problem.accuracy_frame
+    tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(known)))
     blind = np.zeros(len(poses), bool)
+    floor: FloatArray = np.zeros(len(poses))
     if len(poses):
-        tests = accuracy_rows(*robot.positions_and_jacobian(poses), problem.accuracy_frame)
-        felt = accuracy_rows(*problem.robot.positions_and_jacobian(poses), problem.accuracy_frame)
+        tests = accuracy_rows(*_points_and_columns(single, poses), frame)
+        felt = accuracy_rows(*problem.robot.positions_and_jacobian(poses), frame)
         unseen = np.abs(felt @ identifiable.directions.T).max(axis=(1, 2), initial=0.0)
         blind = unseen > FELT * np.abs(felt).max()
-    everywhere = accuracy_rows(problem.robot.positions(q), jacobians, problem.accuracy_frame)[:, :, free]
-    single = InformationModel(robot, problem.instrument, problem.repeatability)
+    columns = jacobians[:, :, free]
+    general_floor = 0.0
+    if isinstance(single, ExtendedModel):
+        columns = single.columns(q)
+        floor, general_floor = single.floor(poses), float(single.floor(q).mean())
+    everywhere = accuracy_rows(problem.robot.positions(q), columns, frame)
     return PlanSpace(
         problem=problem,
         robot=robot,
         identifiability=identifiable,
         interest=interest,
-        model=InformationModel(robot, problem.instrument, problem.repeatability, problem.repetitions),
+        model=model,
         single=single,
-        prior=prior[np.ix_(free, free)],
+        prior=known,
         feasibility=feasibility,
         test_jacobians=tests,
+        test_floor=floor,
         blind=blind,
         general=accuracy_weights(everywhere).mean(axis=0),
-        sample=single.at(q).mean(axis=0),
+        general_floor=general_floor,
     )
+
+
+def _model(problem: PlanProblem, robot: Robot, repetitions: int) -> Model:
+    model = problem.whole_model
+    if model is None:
+        return InformationModel(robot, problem.instrument, problem.repeatability, repetitions)
+    return ExtendedModel.of(robot, model, problem.test_pose_array, repetitions, problem.repeatability)
+
+
+def _points_and_columns(model: Model, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(N, targets, 3) and (N, 3·targets, p) at ``q`` (N, joints)."""
+    if isinstance(model, ExtendedModel):
+        return model.robot.positions(q), model.columns(q)
+    return model.robot.positions_and_jacobian(q)
+
+
+MEASURED_TOGETHER = 60
+"""Visits measured already that share the joints' errors here: beyond that they are taken run by run."""
+
+
+def _with_other_terms(problem: PlanProblem, model: ExtendedModel, known: FloatArray) -> FloatArray:
+    """M₀ (p, p) from that of the parameters (P, P): the other terms, and what is measured already.
+
+    The joint functions that are eliminated (see ``extended``) are shared among what is measured already, but not
+    by that and the plan.
+    """
+    result = np.eye(model.size)
+    result[: len(known), : len(known)] = known
+    data = problem.prior.measured
+    if data is None:
+        return result
+    for first in range(0, len(data.q), MEASURED_TOGETHER):
+        part = slice(first, first + MEASURED_TOGETHER)
+        info, use = model.linearised(data.q[part]), np.repeat(data.seen[part], 3, axis=1).ravel()
+        size = len(info.poses)
+        rows, v = info.stacked(size)[0][use], info.covariance(size)[0][np.ix_(use, use)]
+        result += rows.T @ np.linalg.solve(v, rows)
+    return result
 
 
 def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArray:
@@ -264,20 +332,29 @@ def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArra
     return q if len(q) <= SAMPLE else q[rng.choice(len(q), SAMPLE, replace=False)]
 
 
-def _prior_rows(problem: PlanProblem) -> FloatArray:
-    """(rows, P) whitened equations known beforehand: M_0 = rowsᵀ rows."""
+def _stated_rows(problem: PlanProblem) -> FloatArray:
+    """(rows, P) whitened equations that somebody states of the parameters."""
     names = problem.robot.parameter_names
-    rows: list[FloatArray] = [np.zeros((0, len(names)))]
+    rows = [np.zeros((0, len(names)))]
     for name, std in problem.prior.std.items():
         rows.append((np.arange(len(names)) == names.index(name))[None] / std)
-    if problem.prior.measured is not None:
-        data = problem.prior.measured
-        points, jacobian = problem.robot.positions_and_jacobian(data.q)
-        noise = problem.instrument.covariance(points) + problem.repeatability**2 * np.eye(3)
-        whitener = np.linalg.inv(np.linalg.cholesky(noise))
-        whitened = whitener @ jacobian.reshape(*points.shape, -1)
-        rows.append(whitened[data.seen].reshape(-1, len(names)))
+    if problem.error_model is not None:
+        precision = problem.error_model.precision(problem.robot)[: len(names), : len(names)]
+        values, vectors = np.linalg.eigh(precision)
+        rows.append((vectors * np.sqrt(np.maximum(values, 0.0))).T[values > 0.0])
     return np.concatenate(rows)
+
+
+def _measured_rows(problem: PlanProblem) -> FloatArray:
+    """(rows, P) whitened equations of what is measured already, the points' own noise alone."""
+    names, data = problem.robot.parameter_names, problem.prior.measured
+    if data is None:
+        return np.zeros((0, len(names)))
+    points, jacobian = problem.robot.positions_and_jacobian(data.q)
+    noise = problem.instrument.covariance(points) + problem.repeatability**2 * np.eye(3)
+    whitener = np.linalg.inv(np.linalg.cholesky(noise))
+    whitened = whitener @ jacobian.reshape(*points.shape, -1)
+    return np.asarray(whitened[data.seen].reshape(-1, len(names)))
 
 
 def _check_enough(problem: PlanProblem, jacobians: FloatArray, prior: FloatArray) -> None:

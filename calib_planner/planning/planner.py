@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray, one_thread
-from calib_planner.error_model import FELT, covariance, error_variance
+from calib_planner.error_model import FELT, ErrorModel, Poses, covariance, error_variance
 from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.prove import Proof, prove_bound
 from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
-from calib_planner.planning.discrepancy import PredictionProblem, choose_for_prediction
+from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space
 from calib_planner.planning.problem import PlanProblem
-from calib_planner.planning.result import STATUS, Plan, PlanQuality
+from calib_planner.planning.result import STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.planning.tour import visiting_order
@@ -33,6 +33,10 @@ GOOD_ENOUGH = 0.012
 
 AGREEMENT = 2e-4
 """Difference of log values below which two parts of the search have reached the same plan."""
+
+
+DIVIDED = "Its bound may divide measurements among any number of configurations, which no plan can."
+"""Why efficiencies are small with a whole error model."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ def plan(
     """
     space = plan_space(problem)
     clock = _Clock(problem, len(space.interest), callback)
-    *seeds, own = np.random.SeedSequence(problem.search.seed).spawn(len(parts(problem.search.starts)) + 1)
+    *seeds, own = np.random.SeedSequence(problem.search.seed).spawn(len(parts(problem.starts)) + 1)
     criterion, target = _criteria(space, np.random.default_rng(own))
     rng = np.random.default_rng(own)
     design = _approximate(space, target, rng, clock.over) if target.concave else None
@@ -114,7 +118,7 @@ class _Clock:
         self.callback = callback
         self.problem, self.size = problem, size
         self.cancelled = self.late = False
-        self.last = Progress(0, problem.search.starts, float("nan"), float("nan"), 0.0)
+        self.last = Progress(0, problem.starts, float("nan"), float("nan"), 0.0)
 
     def over(self) -> bool:
         self.late = self.late or time.perf_counter() > self.deadline
@@ -193,7 +197,7 @@ def _search(
         support=design.support if design else nobody,
         weights=design.weights if design else np.empty(0),
     )
-    sizes = parts(space.problem.search.starts)
+    sizes = parts(space.problem.starts)
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
     best: SearchResult | None = None
     done = evaluations = 0
@@ -238,9 +242,9 @@ def _choose(
     problem = space.problem
     candidates = np.asarray(problem.candidate_array)
     allowed = np.flatnonzero(space.feasibility.mask(candidates))
-    if problem.discrepancy is not None:
-        chosen = choose_for_prediction(prediction_problem(problem, candidates[allowed]), clock.over)
-        return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
+    together = None
+    if isinstance(space.model, ExtendedModel):
+        together = space.model.linearised(candidates[allowed])
     request = ChoiceProblem(
         rows=space.model.whitened(candidates[allowed]),
         criterion=criterion,
@@ -248,33 +252,12 @@ def _choose(
         size=problem.configurations,
         repeat=not problem.once_each,
         weights=design.weights if design else np.empty(0),
-        names=space.robot.parameter_names,
+        names=space.robot.parameter_names if together is None else (),
+        together=together,
     )
     chosen = choose(request, rng, clock.over)
-    clock.tell(problem.search.starts, chosen.log_value)
+    clock.tell(problem.starts, chosen.log_value)
     return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
-
-
-def prediction_problem(problem: PlanProblem, candidates: FloatArray) -> PredictionProblem:
-    """The choice from ``candidates`` (C, joints) [rad | m] for a plan problem with ``discrepancy``."""
-    assert problem.discrepancy is not None
-    robot = problem.robot
-    std = problem.discrepancy.prior_std(robot)
-    for name, value in problem.prior.std.items():
-        std[robot.parameter_names.index(name)] = value
-    nothing = np.empty((0, len(robot.joint_names)))
-    return PredictionProblem(
-        robot=robot,
-        candidates=candidates,
-        test_poses=problem.test_pose_array,
-        shares=problem.weight_array / problem.weight_array.sum(),
-        size=problem.configurations,
-        discrepancy=problem.discrepancy,
-        noise=problem.instrument,
-        repetitions=problem.repetitions,
-        prior_std=std,
-        measured=nothing if problem.prior.measured is None else problem.prior.measured.q,
-    )
 
 
 # ── the answer ───────────────────────────────────────────────────────────────────────────────────────
@@ -291,9 +274,10 @@ def _assemble(
     problem, robot = space.problem, space.robot
     configurations = _rest_idle_joints(space, result.configurations)
     configurations = configurations[visiting_order(configurations, robot)]
-    matrix = space.model.at(configurations).sum(axis=0) + space.prior
+    matrix = space.model.totals(configurations, len(configurations))[0] + space.prior
     inverse, hidden = covariance(matrix)
-    per = np.sqrt([error_variance(rows, inverse, hidden) for rows in space.test_jacobians])
+    squares = np.array([error_variance(rows, inverse, hidden) for rows in space.test_jacobians])
+    per = np.sqrt(squares + space.test_floor)
     per[space.blind] = np.inf
     shares = problem.weight_array / max(problem.weight_array.sum(), 1e-300)
     accuracy = float(np.sqrt(shares[shares > 0] @ per[shares > 0] ** 2)) if len(per) else float("nan")
@@ -308,19 +292,18 @@ def _assemble(
     size, n = len(space.interest), problem.measurements
     value = psi if problem.compound else reported_value(name, psi, size, n)
     value_bound = bound if problem.compound or not design else reported_value(name, bound, size, n)
-    general = float("inf") if hidden.size else float(np.trace(space.general @ inverse))
+    general = float("inf") if hidden.size else float(np.trace(space.general @ inverse)) + space.general_floor
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
     status = "singular" if (hidden.size or space.blind.any()) and status == "ok" else status
     combinations = space.identifiability.combinations
     note = f" Not identifiable by any plan, fixed at nominal: {', '.join(combinations)}." if combinations else ""
-    if problem.discrepancy is not None:
-        note += (
-            " Chosen for a robot with systematic errors; value, bound and efficiency are for white noise alone."
-        )
     if space.blind.any():
         note += " No configuration shows what a test pose needs: its error is unlimited."
     elif combinations and (problem.compound or problem.criterion not in POSE_CRITERIA):
         note += " The criterion holds for this choice of parameters."
+    if problem.whole_model is not None:
+        note += f" Planned for a robot that errs by the error model {problem.whole_model.name!r}."
+        note += " " + DIVIDED if design else ""
     note += f" {proof.text}" if proof else ""
     quality = PlanQuality(
         predicted_accuracy_per_test_pose=per,
@@ -340,6 +323,9 @@ def _assemble(
         seed=problem.search.seed,
         starts=result.starts,
         evaluations=result.evaluations,
+        accuracy_frame=problem.accuracy_frame,
+        error_model="paper" if problem.error_model is None else problem.error_model.name,
+        terms=_terms(space, inverse),
     )
     return Plan(
         robot=robot.name,
@@ -352,6 +338,34 @@ def _assemble(
         sigma=problem.instrument.typical,
         quality=quality,
     )
+
+
+def _terms(space: PlanSpace, inverse: FloatArray) -> tuple[PlannedTerm, ...]:
+    """How large the terms of the error model are at the test poses, before and after the plan."""
+    poses, robot = space.problem.test_pose_array, space.robot
+    if not len(poses):
+        return ()
+    count, points = len(poses) * len(robot.targets), Poses(robot, poses)
+    model = space.problem.error_model or ErrorModel.paper(space.problem.instrument)
+    rows = space.model.columns(poses).reshape(-1, len(space.prior))
+    first = len(robot.parameter_names)
+    last = space.model.first if isinstance(space.model, ExtendedModel) else first
+    places = {"placement": slice(0, first), "gravity": slice(first, last), "joint_functions": slice(last, None)}
+    result = []
+    for name, place in places.items():
+        own, known = rows[:, place], space.prior[place, place]
+        if not own.shape[1]:
+            continue
+        before, unknown = covariance(known)
+        size = np.sqrt(np.sum((own @ before) * own) / count) if not unknown.size else np.nan
+        std = np.sqrt(np.sum((own @ inverse[place, place]) * own) / count)
+        result.append(PlannedTerm(name, float(size), float(std)))
+    parts = model.visit_parts(points)
+    for name, members in (("visits", ("repeatability", "shared")), ("points", ("instrument", "floor"))):
+        square = sum(float(np.einsum("nii->", parts[m])) for m in members if m in parts)
+        if square:
+            result.append(PlannedTerm(name, float(np.sqrt(square / count)), float("nan")))
+    return tuple(result)
 
 
 def _rest_idle_joints(space: PlanSpace, configurations: FloatArray) -> FloatArray:
@@ -383,7 +397,7 @@ def _efficiency(name: str, psi: float, bound: float, value: float, value_bound: 
 
 def _psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
     """Ψ of a plan; 0 where it is blind to what the criterion needs."""
-    matrix = space.model.at(configurations).sum(axis=0) + space.prior
+    matrix = space.model.totals(configurations, len(configurations))[0] + space.prior
     hidden = covariance(matrix)[1]
     return 0.0 if _blind(space, hidden) else criterion.exact(_regular(matrix, hidden))
 
@@ -408,7 +422,8 @@ def _regular(matrix: FloatArray, hidden: FloatArray) -> FloatArray:
 def _parameter_deviations(space: PlanSpace, inverse: FloatArray, hidden: FloatArray) -> FloatArray:
     """(P,) standard deviations: infinite where this plan is blind, NaN where every plan is."""
     free = sorted(space.identifiability.free)
-    unseen = (np.abs(hidden) > 1e-6).any(axis=1) if hidden.size else np.zeros(len(free), bool)
-    std = np.full(len(free) + len(space.identifiability.fixed), np.nan)
-    std[free] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)))
+    count = len(free)
+    unseen = (np.abs(hidden[:count]) > 1e-6).any(axis=1) if hidden.size else np.zeros(count, bool)
+    std = np.full(count + len(space.identifiability.fixed), np.nan)
+    std[free] = np.where(unseen, np.inf, np.sqrt(np.diag(inverse)[:count]))
     return std

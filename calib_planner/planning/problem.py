@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
-from calib_planner.error_model import ACCURACIES
+from calib_planner.error_model import ACCURACIES, ErrorModel, gravity_of, typical
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA
-from calib_planner.planning.discrepancy import ModelDiscrepancy
 from calib_planner.planning.feasibility import Constraint
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
@@ -68,31 +67,49 @@ class Candidates:
     repeat: bool = False
 
 
+PAPERS_SHARE = 5e-5
+"""Share of the accuracy everywhere without an error model: it costs the test pose 0.2 % of efficiency."""
+GENERAL_SHARE = 0.05
+"""The same with one. A plan for one pose alone measures that pose again and again, which takes out what the
+joints err there, and tells nothing of the robot. docs/planning-real-robots.md shows what it costs and gives."""
+
+
 @dataclass(frozen=True)
 class Search:
     """How the planner searches.
 
     Attributes:
-        starts: Random starts.
+        starts: Random starts; ``None``: 48, and 8 with a whole error model, whose evaluations take longer.
         seed: The same seed gives the same plan.
         time_limit: Seconds after which the best plan so far is returned.
         general_weight: Share of the test-pose criterion given to the mean accuracy over all joint limits. It
             prevents that a plan leaves parameters unseen that matter only away from the test poses; 0 is the
-            paper's plain criterion.
+            paper's plain criterion. ``None``: ``PAPERS_SHARE``, and ``GENERAL_SHARE`` with a whole error model.
     """
 
-    starts: int = 48
+    starts: int | None = None
     seed: int = 0
     time_limit: float = float("inf")
-    general_weight: float = 5e-5
+    general_weight: float | None = None
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        put(self, "starts", check_count("starts", self.starts, high=100_000))
+        if self.starts is not None:
+            put(self, "starts", check_count("starts", self.starts, high=100_000))
         put(self, "seed", check_count("seed", self.seed, low=0, high=2**63 - 1))
         if not self.time_limit > 0:
             raise InputError("time_limit", self.time_limit, "a number of seconds > 0")
-        put(self, "general_weight", check_number("general_weight", self.general_weight, low=0, high=1))
+        if self.general_weight is not None:
+            put(self, "general_weight", check_number("general_weight", self.general_weight, low=0, high=1))
+
+    def chosen(self, whole: bool) -> Search:
+        """The same with the values that stand for ``None``; ``whole``: with a whole error model."""
+        starts, share = (8, GENERAL_SHARE) if whole else (48, PAPERS_SHARE)
+        return replace(
+            self,
+            starts=starts if self.starts is None else self.starts,
+            general_weight=share if self.general_weight is None else self.general_weight,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +129,12 @@ class PlanProblem:
             the same up to a rigid motion of the base.
         compound: Other criteria with their shares, e.g. ``{"d": 0.3}``: the plan then maximises the weighted
             geometric mean of efficiencies, in which ``criterion`` has the rest of the weight.
-        noise: The instrument; a number is the standard deviation of every coordinate of a point [m].
+        error_model: How the robot errs, (M1): all its terms are in the information, in the prior and in the
+            accuracy. ``None``: as the paper has it, by ``noise`` alone.
+        noise: The instrument; a number is the standard deviation of every coordinate of a point [m]. With an
+            error model it is that of the model.
         repeatability: σ_c, error of one coordinate that repeating a measurement at the same configuration does
             not average away [m].
-        discrepancy: What the real robot has beyond any geometric model (see ``discrepancy``). The plan is then
-            chosen from ``candidates`` for the smallest expected error at the test poses on such a robot;
-            value and bound stay those of the criterion. ``None`` is the paper's plain criterion.
         prior: What is known of the parameters beforehand.
         constraints: Conditions on configurations besides the joint limits.
         candidates: Configurations to choose from; ``None`` means all that are feasible.
@@ -133,12 +150,12 @@ class PlanProblem:
     compound: Mapping[str, float] = field(default_factory=dict)
     noise: Noise | float = 3e-5
     repeatability: float = 0.0
-    discrepancy: ModelDiscrepancy | None = None
     prior: PlanPrior = PlanPrior()
     constraints: tuple[Constraint, ...] = ()
     candidates: Candidates | None = None
     search: Search = Search()
     accuracy_frame: str = "world"
+    error_model: ErrorModel | None = None
 
     def __post_init__(self) -> None:
         put, robot = object.__setattr__, self.robot
@@ -154,19 +171,22 @@ class PlanProblem:
         self._check_poses()
         put(self, "configurations", check_count("configurations", self.configurations, high=10_000))
         put(self, "repetitions", check_count("repetitions", self.repetitions, high=100_000))
+        if self.error_model is not None:
+            points = self.error_model.points
+            floor = self.error_model.values.get("floor", 0.0)
+            put(self, "noise", Isotropic(floor) if points.noise is None else points.noise)
         if not hasattr(self.noise, "covariance"):
             put(self, "noise", Isotropic(self.noise))
         common = check_number("repeatability", self.repeatability, low=0, high=1, unit="m")
         put(self, "repeatability", common)
         put(self, "prior", self.prior.checked(robot))
+        put(self, "search", self.search.chosen(self.whole_model is not None))
         put(self, "constraints", tuple(self.constraints))
         if self.candidates is not None:
             q = check_configurations("candidates", self.candidates.configurations, robot.joint_names)
             put(self, "candidates", replace(self.candidates, configurations=q))
             if not self.candidates.repeat and len(q) < self.configurations:
                 raise InputError("candidates", f"{len(q)} rows", f"at least {self.configurations}, one each")
-        if self.discrepancy is not None:
-            self._check_discrepancy()
 
     def _check_poses(self) -> None:
         put, robot = object.__setattr__, self.robot
@@ -185,13 +205,23 @@ class PlanProblem:
             raise InputError("weights", weights.tolist(), "numbers >= 0, not all zero")
         put(self, "weights", weights)
 
-    def _check_discrepancy(self) -> None:
-        if self.candidates is None:
-            raise InputError("discrepancy", "no candidates", "candidates to choose from", "draw some hundred")
-        if self.criterion != "test_pose" or self.compound:
-            raise InputError("discrepancy", f"criterion {self.criterion}", "criterion test_pose, not compound")
-        if self.candidates.repeat:
-            raise InputError("discrepancy", "repeat_candidates", "candidates chosen once each")
+    @property
+    def whole_model(self) -> ErrorModel | None:
+        """The error model, or ``None`` where it is the paper's: nothing but flat parameters and noise."""
+        model = self.error_model
+        return None if model is None or model.is_papers else model
+
+    @property
+    def starts(self) -> int:
+        """Starts of the search, with the value that stands for ``None``."""
+        assert self.search.starts is not None
+        return self.search.starts
+
+    @property
+    def general_weight(self) -> float:
+        """Share of the accuracy everywhere, with the value that stands for ``None``."""
+        assert self.search.general_weight is not None
+        return self.search.general_weight
 
     @property
     def test_pose_array(self) -> FloatArray:
@@ -225,17 +255,27 @@ class PlanProblem:
         return self.configurations * self.repetitions
 
 
-def usual_discrepancy(
-    robot: Robot, criterion: str, candidates: Candidates | None, compound: Mapping[str, float] | None = None
-) -> ModelDiscrepancy | None:
-    """What a plan problem expects of the robot beyond its geometric model if the user says nothing about it.
+PAPERS_ROBOTS = ("planar_2r", "kuka_kr270")
+"""Robots of the paper: planned for as the paper has it unless somebody asks for more."""
 
-    A robot from a URDF is a real one, which errs systematically, and candidates show what it can be driven to.
-    Other robots, other criteria and requests without candidates get the paper's plain criterion (``None``).
+
+def usual_error_model(robot: Robot, noise: Noise | float) -> ErrorModel:
+    """How a robot is expected to err if the user says nothing about it.
+
+    A real robot errs by all terms, of typical size. What is known of its chain is taken as wide as the spread of
+    its scales allows, a factor of one standard deviation: plans that trust tight tolerances lose on robots that
+    do not keep them. The robots of the paper get the paper's model.
     """
-    plain = criterion == "test_pose" and not compound
-    applies = robot.from_urdf and plain and candidates is not None and not candidates.repeat
-    return ModelDiscrepancy() if applies else None
+    instrument = Isotropic(noise) if isinstance(noise, (float, int)) else noise
+    if robot.name in PAPERS_ROBOTS:
+        return ErrorModel.paper(instrument)
+    return with_wide_placement(typical(instrument, gravity=gravity_of(robot)))
+
+
+def with_wide_placement(model: ErrorModel) -> ErrorModel:
+    """The model with the tolerances of the chain at their median times their factor."""
+    wide = {s.name: s.median * s.factor for s in model.scales if s.name.startswith("placement.")}
+    return model.with_values(wide)
 
 
 def _check_compound(shares: Mapping[str, float]) -> dict[str, float]:

@@ -74,8 +74,7 @@ def random_accuracies(space: PlanSpace, count: int, rng: np.random.Generator) ->
     values = []
     for first in range(0, count, batch):
         plans = min(batch, count - first)
-        unit = space.model.at(space.feasibility.sample(rng, plans * size))
-        matrices = unit.reshape(plans, size, *space.prior.shape).sum(axis=1) + space.prior
+        matrices = space.model.totals(space.feasibility.sample(rng, plans * size), size) + space.prior
         psi = criterion.value_and_gradient(matrices)[0]
         values.append(np.where(psi > 0, np.maximum(psi, 1e-300) ** -0.5, np.inf))
     return np.concatenate(values)

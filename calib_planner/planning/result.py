@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,24 @@ STATUS = {
 """Every status a plan can have, with advice."""
 
 NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class PlannedTerm:
+    """A term of the error model.
+
+    Attributes:
+        name: ``placement``, ``gravity``, ``joint_functions``, ``visits`` or ``points``.
+        size: Root mean square of what it moves a point at the test poses by before anything is measured [m]; NaN
+            where nothing is known of it.
+        std: The same after the plan [m]; NaN for visits and points, which are new each time.
+        gain: Of the left-out log score; NaN, since nothing is measured yet.
+    """
+
+    name: str
+    size: float
+    std: float
+    gain: float = NAN
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +64,9 @@ class PlanQuality:
         seed: The seed that reproduces the plan.
         starts: Number of starts of the search.
         evaluations: Number of plans evaluated.
+        accuracy_frame: What the accuracies are, ``world`` or ``robot``, (M3).
+        error_model: Name of the error model.
+        terms: How large its terms are at the test poses.
     """
 
     predicted_accuracy_per_test_pose: FloatArray
@@ -65,6 +86,9 @@ class PlanQuality:
     seed: int = 0
     starts: int = 0
     evaluations: int = 0
+    accuracy_frame: str = "world"
+    error_model: str = "paper"
+    terms: tuple[PlannedTerm, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("predicted_accuracy_per_test_pose", "parameter_std"):
@@ -115,13 +139,18 @@ class Plan:
     @staticmethod
     def from_values(values: Mapping[str, Any]) -> Plan:
         """The plan whose ``values`` these are."""
-        quality = {f.name: values[f.name] for f in fields(PlanQuality)}
+        quality = {f.name: values[f.name] for f in fields(PlanQuality) if f.name in values}
         own = {name: value for name, value in values.items() if name not in quality}
         return Plan(**own, quality=PlanQuality(**quality))
 
     def to_dict(self) -> dict[str, Any]:
-        """``values`` as plain lists and numbers, the keys of the contract; non-finite numbers become ``None``."""
-        return plain(self.values())
+        """``values`` as plain lists and numbers, the keys of the contract; non-finite numbers become ``None``.
+
+        With what the accuracies are, and the error model that they rest on.
+        """
+        quality = self.quality
+        model = {"name": quality.error_model, "terms": [asdict(t) for t in quality.terms]}
+        return plain(self.values() | {"accuracy_frame": quality.accuracy_frame, "error_model": model})
 
 
 KEYS = (
@@ -131,5 +160,5 @@ KEYS = (
     "seconds", "seed", "starts", "evaluations",
 )  # fmt: skip
 """Order of the keys of a plan in JSON and YAML."""
-KINDS = {f.name: str(f.type) for f in (*fields(Plan), *fields(PlanQuality)) if f.name != "quality"}
+KINDS = {f.name: str(f.type) for f in (*fields(Plan), *fields(PlanQuality)) if f.name in KEYS}
 """Type of every value of a plan, by its key."""

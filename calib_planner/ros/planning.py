@@ -24,7 +24,7 @@ from calib_planner.planning import (
     PlanProblem,
     Search,
     plan,
-    usual_discrepancy,
+    usual_error_model,
 )
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import check_rows
@@ -102,18 +102,21 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         raise InputError("configurations", size, most)
     criterion = request.criterion or settings.criterion
     candidates = _candidates(request, settings, robot)
+    noise = _number(request, settings, "sigma")
     return PlanProblem(
         robot,
         poses,
         size,
         repetitions=int(request.repetitions) or settings.repetitions,
         weights=_weights(request),
-        noise=_number(request, settings, "sigma"),
+        noise=noise,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        discrepancy=usual_discrepancy(robot, criterion, candidates),
+        error_model=usual_error_model(robot, noise),
         search=Search(
-            starts=settings.starts, seed=int(request.seed), time_limit=_number(request, settings, "time_limit")
+            starts=settings.starts or None,
+            seed=int(request.seed),
+            time_limit=_number(request, settings, "time_limit"),
         ),
         candidates=candidates,
     )

@@ -78,7 +78,7 @@ class PlannerParameters(PlanParameters):
     configurations: int = parameter(12, "configurations of a plan, if the request names none", "", 1, 10000)
     repetitions: int = parameter(1, "measurements at each configuration, if the request names none", "", 1, 10000)
     sigma: float = parameter(3e-5, "noise of one coordinate of one measurement", "m", 1e-9, 1.0)
-    starts: int = parameter(64, "random starts of the search", "", 1, 100000)
+    starts: int = parameter(0, "random starts of the search; 0: as many as usual", "", 0, 100000)
     most_configurations: int = parameter(200, "largest number of configurations in a request", "", 1, 10000)
     most_test_poses: int = parameter(1000, "largest number of test poses in a request", "", 1, 10000)
     most_candidates: int = parameter(2000, "largest number of candidates in a request", "", 1, 10000)

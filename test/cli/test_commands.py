@@ -315,16 +315,18 @@ UR10 = SHARED_DATA / "ur10_tracker"
 
 @pytest.mark.skipif(not UR10.is_dir(), reason="the measured data are not here")
 def test_real_robots_are_planned_with_their_systematic_errors(call: Any, tmp_path: Path) -> None:
-    """A URDF robot and candidates: the discrepancy is expected unless it is switched off."""
+    """A robot from a URDF is expected to err by all terms unless that is switched off."""
     pool = tmp_path / "pool.csv"
     pool.write_text("".join((UR10 / "random_poses.csv").read_text().splitlines(keepends=True)[:151]))
     words = [
         "plan", "--robot", str(UR10 / "ur10.urdf"), "--parameters", "full", "--unknown", "base,tool",
         "--candidates", str(pool), "--test-pose", "0 -1.5 1.5 0 1 0", "--configurations", "12", "--json",
     ]  # fmt: skip
-    real, paper = call(*words), call(*words, "--discrepancy", "off")
-    assert "systematic errors" in real["message"]
-    assert "systematic errors" not in paper["message"]
+    real, paper = call(*words), call(*words, "--error-model", "paper")
+    assert real["error_model"]["name"] == "typical" and "typical" in real["message"]
+    assert paper["error_model"]["name"] == "paper" and paper == call(*words, "--discrepancy", "off") | {
+        "seconds": paper["seconds"]
+    }
     assert real["configurations"] != paper["configurations"]
     assert paper["predicted_accuracy"] <= real["predicted_accuracy"]
 

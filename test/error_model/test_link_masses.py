@@ -54,7 +54,7 @@ def moments(robot: Robot, q: np.ndarray) -> np.ndarray:
     count = sum(mass == LINKS for mass, _ in gravity._pairs(robot))
     total = sum(part.mass for part in robot.link_masses)
     result = np.zeros((len(q), len(robot.joint_names)))
-    result[:, :count] = gravity._moments(Poses(robot, q))[:, :count] * total
+    result[:, :count] = gravity.moments(Poses(robot, q))[:, :count] * total
     return result
 
 

@@ -112,7 +112,7 @@ def test_moments_are_the_slope_of_the_potential_energy(robot: Robot, mounting: s
     q = random_configurations(robot, 4)
     hand = replace(robot, parameter_names=()).with_targets([[0.1, 0.2, 0.3]])
     down = robot.base_pose[0] @ gravity.down
-    moments = gravity._moments(Poses(robot, q))
+    moments = gravity.moments(Poses(robot, q))
     for joint in range(len(robot.joint_names)):
         moved = hand._run(q + 1e-30j * np.eye(len(robot.joint_names))[joint], np.zeros(0), columns=False)
         np.testing.assert_allclose(moments[:, joint], (moved.imag / 1e-30).T @ down, atol=1e-12)
@@ -125,23 +125,23 @@ def test_a_mass_on_a_link_loads_only_the_joints_before_it(robot: Robot) -> None:
     other = q.copy()
     other[:, 2:] += 0.3
     np.testing.assert_allclose(
-        gravity._moments(Poses(robot, q)), gravity._moments(Poses(robot, other)), atol=1e-12
+        gravity.moments(Poses(robot, q)), gravity.moments(Poses(robot, other)), atol=1e-12
     )
 
 
 def test_parts_of_one_mass_share_coefficients_and_the_payload_follows_the_visit(robot: Robot) -> None:
     parts = (Mass("arm", 1, (0.1, 0.0, 0.2), 0.75), Mass("arm", None, (0.0, 0.0, 0.1), 0.25))
     both, poses = Gravity(parts), Poses(robot, random_configurations(robot, 3))
-    each = [Gravity((replace(p, name="one", weight=1.0),))._moments(poses) for p in parts]
+    each = [Gravity((replace(p, name="one", weight=1.0),)).moments(poses) for p in parts]
     expected = 0.25 * each[1]
     expected[:, :2] += 0.75 * each[0]
-    np.testing.assert_allclose(both._moments(poses), expected, atol=1e-15)
-    alone = Gravity((Mass("hand", None, (0.0, 0.0, 0.1)),))._moments(poses)
+    np.testing.assert_allclose(both.moments(poses), expected, atol=1e-15)
+    alone = Gravity((Mass("hand", None, (0.0, 0.0, 0.1)),)).moments(poses)
     loaded, masses = Gravity(parts, payload=Payload(4.0, (0.0, 0.0, 0.1))), np.array([0.0, 2.0, 6.0])
     count = loaded.size(robot) - len(robot.joint_names)
-    np.testing.assert_allclose(loaded._moments(poses)[:, count:], alone, atol=1e-15)
-    moments = loaded._moments(replace(poses, payload=masses))
-    np.testing.assert_allclose(moments[:, :count], both._moments(poses), atol=1e-15)
+    np.testing.assert_allclose(loaded.moments(poses)[:, count:], alone, atol=1e-15)
+    moments = loaded.moments(replace(poses, payload=masses))
+    np.testing.assert_allclose(moments[:, :count], both.moments(poses), atol=1e-15)
     np.testing.assert_allclose(moments[:, count:], alone * np.array([0.0, 0.5, 1.5])[:, None], atol=1e-15)
 
 

@@ -28,7 +28,8 @@ from calib_planner.planning.bound import ApproximateDesign, DesignProblem, appro
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, sensitivity, square_root
 from calib_planner.planning.criteria import Accuracy, Criterion, Determinant, Eliminating, PowerMean
-from calib_planner.planning.information import InformationModel
+from calib_planner.planning.extended import ExtendedModel
+from calib_planner.planning.information import Model
 from calib_planner.tracker import Isotropic
 
 TOLERANCE = 1e-4
@@ -42,6 +43,7 @@ MISSED = 5e-4
 PROOF_STATUS = {
     "proven": "The bound is proven",
     "time_limit": "The bound is proven, less closely than wanted because time was up",
+    "model": "The bound stays numerical: with a whole error model the sensitivity is no polynomial of the joints",
     "noise": "The bound stays numerical: only isotropic noise makes the sensitivity a polynomial",
     "joints": "The bound stays numerical: too many joints for a proof",
     "candidates": "The bound is proven: every candidate was looked at",
@@ -115,7 +117,7 @@ def prove_bound(
     Returns:
         The design with the smallest proven bound, and its proof; the design unchanged if nothing is proven.
     """
-    if problem.candidates is not None:
+    if problem.candidates is not None and not isinstance(problem.model, ExtendedModel):
         return design, _prove_candidates(problem, problem.candidates, design.gradient)
     deadline = time.perf_counter() + time_limit
     free = replace(problem, feasibility=replace(problem.feasibility, constraints=()))
@@ -150,7 +152,7 @@ def prove_bound(
 
 
 def prove_maximum(
-    model: InformationModel,
+    model: Model,
     criterion: Criterion,
     gradient: FloatArray,
     known: FloatArray,
@@ -173,7 +175,7 @@ def prove_maximum(
     began = time.perf_counter()
     root = square_root(gradient)
     reason = _obstacle(model)
-    if reason:
+    if reason or isinstance(model, ExtendedModel):
         return Proof(np.inf, np.nan, known[0], root @ root.T, 1.0, 0, (), 0.0, reason)
     values, _ = sensitivity(model, root, known)
     d = polynomial(model, root)
@@ -204,8 +206,10 @@ def _prove_candidates(problem: DesignProblem, candidates: FloatArray, gradient: 
     return Proof(float(d[best]), float(d[best]), q[best], gradient, 1.0, len(q), (), 0.0, "candidates")
 
 
-def _obstacle(model: InformationModel) -> str:
+def _obstacle(model: Model) -> str:
     """Why nothing can be proven, or empty."""
+    if isinstance(model, ExtendedModel):
+        return "model"
     if not isinstance(model.noise, Isotropic):
         return "noise"
     turns = model.robot.joint_is_revolute

@@ -20,6 +20,10 @@ p), without a factorisation per candidate (Miller and Nguyen 1994 for k = 1). Wi
 eliminated, log det S = log det M − log det M_nn is two of them. Rows are scaled by the Cholesky factor of the
 candidates' mean information, which changes log det M by a constant. Other criteria try a shortlist of
 first-order best.
+
+With a whole error model configurations share errors, and what a candidate tells depends on the others (see
+``extended``). The shortlist then holds the candidates that are largest in the sensitivity seen from the choice,
+and a trial takes what the candidate adds to the other rows.
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning.criteria import Criterion, Determinant, Eliminating, log_values
+from calib_planner.planning.extended import LinearisedExtension
 from calib_planner.robot import analyse
 
 RIDGE = 1e-9
@@ -146,6 +151,7 @@ class ChoiceProblem:
         repeat: Whether a row may be chosen more than once.
         weights: (C,) weights of the approximate design, to start from, or empty.
         names: p names of the parameters, for messages.
+        together: The candidates where they share errors, else ``None``; ``rows`` is then each of them alone.
     """
 
     rows: FloatArray
@@ -155,6 +161,7 @@ class ChoiceProblem:
     repeat: bool = False
     weights: FloatArray = field(default_factory=lambda: np.empty(0))
     names: tuple[str, ...] = ()
+    together: LinearisedExtension | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +184,11 @@ def choose(
             combinations of parameters that no candidate shows. Or there are fewer candidates than rows.
     """
     _check(problem)
-    search = _Exact(problem) if _is_determinant(problem.criterion) else _Shortlisted(problem)
+    search: _Exact | _Shortlisted | _Together
+    if problem.together is not None:
+        search = _Together(problem, problem.together)
+    else:
+        search = _Exact(problem) if _is_determinant(problem.criterion) else _Shortlisted(problem)
     best: Choice | None = None
     count = evaluations = 0
     for start in _starts(problem, rng):
@@ -217,7 +228,7 @@ def _starts(problem: ChoiceProblem, rng: np.random.Generator) -> list[IntArray]:
     """Rows to begin from, to be filled up greedily where they are fewer than ``size``."""
     starts = [_rounded(problem)] if len(problem.weights) else []
     starts.append(np.empty(0, np.int64))
-    for _ in range(RANDOM_STARTS):
+    for _ in range(RANDOM_STARTS if problem.together is None else 1):
         starts.append(rng.choice(len(problem.rows), problem.size, replace=problem.repeat))
     return starts
 
@@ -233,6 +244,8 @@ def _rounded(problem: ChoiceProblem) -> IntArray:
 
 
 def _information(problem: ChoiceProblem, rows: IntArray) -> FloatArray:
+    if problem.together is not None and len(rows):
+        return problem.prior + problem.together.rows(rows).sums(len(rows))[0]
     own = problem.rows[rows].reshape(-1, problem.rows.shape[2])
     return problem.prior + own.T @ own
 
@@ -366,3 +379,64 @@ class _Shortlisted:
             gains[rows] = -np.inf
         count = min(SHORTLIST, int(np.isfinite(gains).sum()))
         return np.argpartition(-gains, count - 1)[:count] if count else np.empty(0, np.int64)
+
+
+# ── candidates that share errors ─────────────────────────────────────────────────────────────────────
+
+
+class _Together:
+    """As ``_Exact``."""
+
+    def __init__(self, problem: ChoiceProblem, info: LinearisedExtension) -> None:
+        self.problem, self.info = problem, info
+        flat = problem.rows.reshape(-1, problem.rows.shape[2])
+        self.average = flat.T @ flat / len(problem.rows)
+
+    def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
+        problem, rows = self.problem, self._greedy(start)
+        log_value = float(_log_values(problem, _information(problem, rows)[None])[0])
+        tried = 1
+        for _ in range(MOST_PASSES):
+            improved = False
+            for position in range(problem.size):
+                if cancel():
+                    return rows, tried
+                shortlist = self._best(self._seen(rows), rows)
+                others = np.delete(rows, position)
+                added = self.info.rows(shortlist).given(self.info.rows(others))
+                trial = _log_values(problem, _information(problem, others) + np.swapaxes(added, 1, 2) @ added)
+                tried += len(shortlist)
+                best = int(np.argmax(trial)) if len(trial) else 0
+                if len(trial) and trial[best] > log_value + 1e-6:
+                    rows[position], log_value, improved = shortlist[best], float(trial[best]), True
+            if not improved:
+                break
+        return rows, tried
+
+    def _greedy(self, start: IntArray) -> IntArray:
+        """Fill up with the candidate of largest first-order gain, from a little of the candidates' mean."""
+        chosen, ground = list(start), 1e-3 * self.problem.size * self.average
+        while len(chosen) < self.problem.size:
+            taken = np.array(chosen, np.int64)
+            added = self.info.given(self.info.rows(taken))
+            matrix = ground + _information(self.problem, taken)
+            gradient = self.problem.criterion.value_and_gradient(matrix[None])[1][0]
+            chosen.append(int(self._best(np.sum((added @ gradient) * added, axis=(1, 2)), taken)[0]))
+        return np.array(chosen, np.int64)
+
+    def _seen(self, rows: IntArray) -> FloatArray:
+        """(C,) the sensitivity of every candidate seen from the rows chosen."""
+        info = self.info.rows(rows)
+        seen, _ = info.seen_from(np.ones(len(rows)))
+        matrix = _information(self.problem, rows) + 1e-6 * self.problem.size * self.average
+        gradient = self.problem.criterion.value_and_gradient(matrix[None])[1][0]
+        every = self.info.as_seen_by(seen.model).whitened
+        return np.asarray(np.sum((every @ gradient) * every, axis=(1, 2)))
+
+    def _best(self, gains: FloatArray, taken: IntArray) -> IntArray:
+        """Candidates of largest gain, largest first; not those taken where each may be used once."""
+        gains = np.where(np.isfinite(gains), gains, 0.0)
+        if not self.problem.repeat:
+            gains[taken] = -np.inf
+        order = np.argsort(-gains, kind="stable")[:SHORTLIST]
+        return order[np.isfinite(gains[order])]

@@ -23,14 +23,18 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.planning.criteria import Criterion, ridged
+from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.feasibility import Feasibility
-from calib_planner.planning.information import InformationModel
+from calib_planner.planning.information import InformationModel, Model
 from calib_planner.planning.search.descent import Descent, Mend, Objective, descend, wander
 
 CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
 FINALISTS = 3
 """Plans of each chunk that are polished to the end."""
+EXTENDED_ROUGH, EXTENDED_FINAL = (40, 2e-3), (80, 1e-4)
+"""Most iterations and tolerance of log Ψ with a whole error model: its promise is not known to 0.01 %, and an
+evaluation takes ten times as long."""
 BATCH = 4_000_000
 """Numbers in the inverse Hessians of descents side by side: beyond that, moving them through memory takes longer
 than the work on them, and a large plan would not notice for seconds that it was cancelled."""
@@ -58,7 +62,7 @@ class SearchProblem:
         weights: (K,) their weights.
     """
 
-    model: InformationModel
+    model: Model
     criterion: Criterion
     prior: FloatArray
     size: int
@@ -102,12 +106,13 @@ def search_chunk(
     """One part of the work: ``starts`` descents, the best of them."""
     size = problem.size
     rows, used = _starts(problem, starts, rng, cancel)
-    rough = _descend_from(problem, size, rows, cancel, 80, 1e-4)
-    finalists = rough.x[np.argsort(rough.value)[:FINALISTS]]
-    final = _descend_from(problem, size, finalists, cancel, 200, 1e-7)
+    extended = isinstance(problem.model, ExtendedModel)
+    rough = _descend_from(problem, size, rows, cancel, *(EXTENDED_ROUGH if extended else (80, 1e-4)))
+    finalists = rough.x[np.argsort(rough.value)[: 1 if extended else FINALISTS]]
+    final = _descend_from(problem, size, finalists, cancel, *(EXTENDED_FINAL if extended else (200, 1e-7)))
     work = used + rough.evaluations + final.evaluations
-    if problem.feasibility.constraints:
-        final, more = _along_the_edge(problem, final, rng, cancel)
+    if problem.feasibility.constraints and isinstance(problem.model, InformationModel):
+        final, more = _along_the_edge(problem, problem.model, final, rng, cancel)
         work += more
     best = int(np.argmin(final.value))
     configurations = final.x[best].reshape(size, -1)
@@ -115,16 +120,18 @@ def search_chunk(
 
 
 def _along_the_edge(
-    problem: SearchProblem, final: Descent, rng: np.random.Generator, cancel: Callable[[], bool]
+    problem: SearchProblem,
+    model: InformationModel,
+    final: Descent,
+    rng: np.random.Generator,
+    cancel: Callable[[], bool],
 ) -> tuple[Descent, int]:
     """Improve the best plan by random feasible steps and descents in turn, while that pays."""
     size, best = problem.size, int(np.argmin(final.value))
     row, value, work = final.x[best], float(final.value[best]), 0
     for _ in range(EDGE_ROUNDS):
         plan = row.reshape(size, -1)
-        moved, tried = wander(
-            problem.model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel
-        )
+        moved, tried = wander(model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel)
         descended = _descend_from(problem, size, moved[None], cancel, 60, 1e-6)
         work += tried + descended.evaluations
         gained = value - float(descended.value[0])
@@ -141,14 +148,16 @@ def _starts(
     """(rows, size, joints) starting plans, and plans evaluated on the way."""
     size, draw = problem.size, problem.feasibility.sample
     parts, evaluations = [], 0
-    rounded = -(-starts // 3) if len(problem.support) else 0
+    extended = isinstance(problem.model, ExtendedModel)
+    rounded = -(-starts * (2 if extended else 1) // 3) if len(problem.support) else 0
     if rounded:
         picks = rng.choice(len(problem.support), (rounded, size), p=problem.weights)
         parts.append(_shake(problem, problem.support[picks], rng))
     # So many configurations are needed to identify everything without a prior.
     robot = problem.model.robot
     kernel_size = max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
-    tiled = -(-starts // 3) if kernel_size < size else 0
+    # Where equal configurations repeat their error, a small plan repeated is no good start.
+    tiled = -(-starts // 3) if kernel_size < size and not extended else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
         kernel = _descend_from(problem, kernel_size, first, cancel, 80, 1e-4)
@@ -156,8 +165,9 @@ def _starts(
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
         parts.append(_shake(problem, kernel.x[best].reshape(len(best), kernel_size, -1)[:, rows], rng))
-    random = max(starts - rounded - tiled, 1)
-    parts.append(draw(rng, random * size).reshape(random, size, -1))
+    random = max(starts - rounded - tiled, 0 if extended and rounded else 1)
+    if random:
+        parts.append(draw(rng, random * size).reshape(random, size, -1))
     return np.concatenate(parts), evaluations
 
 

@@ -1,0 +1,223 @@
+"""Information under a whole error model: gradient, elimination, bound, and the plans that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import mixed, random_configurations
+
+from calib_planner import InfeasibleError, PlanProblem, Robot, plan
+from calib_planner.error_model import (
+    ErrorModel,
+    Gravity,
+    JointFunctions,
+    Knowledge,
+    Placement,
+    Poses,
+    covariance,
+    error_variance,
+    typical,
+)
+from calib_planner.error_model.knowledge import information, prior_information
+from calib_planner.measurements import Measurements
+from calib_planner.planning import Candidates, PlanPrior, Search, plan_space, with_wide_placement
+from calib_planner.planning.bound import approximate_design
+from calib_planner.planning.extended import ExtendedModel
+from calib_planner.planning.planner import _design_problem, value_of
+from calib_planner.planning.search.exchange import ChoiceProblem, _information, choose
+from calib_planner.tracker import Isotropic, LaserTracker
+
+POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
+TRACKER = LaserTracker(station=[3.0, 1.0, 0.0])
+FEW = Search(starts=4)
+
+
+def kuka(unknown: tuple[str, ...] = ()) -> Robot:
+    return Robot.load("kuka_kr270").with_parameters("lengths+offsets", unknown)
+
+
+def of(robot: Robot, model: ErrorModel, felt: int = 2) -> tuple[ExtendedModel, np.ndarray]:
+    """A model, and eight configurations of which some are close to each other."""
+    q = random_configurations(robot, 8, 1) / 2
+    q[1], q[5] = q[0] + 0.05, q[4] - 0.03
+    low, high = robot.joint_limits.T
+    tests = random_configurations(robot, felt, 3) / 3
+    return ExtendedModel.of(robot, model, tests, 2, 1e-5), np.clip(q, low + 0.01, high - 0.01)
+
+
+CASES = {
+    "kuka": (kuka(), typical(Isotropic(3e-5))),
+    "slides, two targets, tracker": (mixed().with_parameters("full", ("base", "tool")), typical(TRACKER)),
+    "no joint functions": (kuka(), replace(typical(TRACKER), joint_functions=None)),
+    "gravity alone": (kuka(), replace(typical(TRACKER), joint_functions=None, visits=None)),
+    "smooth": (
+        kuka(),
+        replace(typical(Isotropic(3e-5)), gravity=None, joint_functions=JointFunctions(("smooth",))),
+    ),
+}
+
+
+@pytest.fixture(params=CASES, ids=str)
+def case(request: pytest.FixtureRequest) -> tuple[Robot, ErrorModel]:
+    return CASES[request.param]
+
+
+def test_the_gradient_is_that_of_the_information(case: tuple[Robot, ErrorModel]) -> None:
+    model, q = of(*case)
+    draw = np.random.default_rng(0).standard_normal((2, model.size, model.size))
+    weights = draw @ np.swapaxes(draw, 1, 2)
+    seen = model.linearised(q[:4]).seen_from(np.array([1.0, 2.0, 1.0, 0.5]))[0].model
+    for asked, size in ((model, 4), (seen, 1)):
+        each = np.repeat(weights, 4 // size, axis=0)
+        got, step, expected = asked.linearised(q).gradient(each), 1e-6, np.zeros(q.shape)
+        for place in np.ndindex(*q.shape):
+            moved = np.zeros(q.shape)
+            moved[place] = step
+            rise = asked.totals(q + moved, size) - asked.totals(q - moved, size)
+            expected[place] = np.sum(rise * each) / (2 * step)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_what_is_eliminated_is_the_schur_complement(case: tuple[Robot, ErrorModel]) -> None:
+    """The accuracy at the test poses is that of all coefficients together."""
+    robot, error_model = case
+    q, tests = of(robot, error_model)[1], random_configurations(robot, 2, 3) / 3
+    problem = PlanProblem(robot, tests, len(q), repetitions=2, error_model=error_model)
+    matrix = prior_information(robot, error_model) + 2 * information(robot, error_model, q).sum(axis=0)
+    expected = Knowledge.from_information(robot, error_model, matrix).accuracy(tests).value
+    assert value_of(problem, q) == pytest.approx(expected, rel=1e-6)
+    space = plan_space(problem)
+    inverse = covariance(space.model.totals(q, len(q))[0] + space.prior)
+    per_pose = [np.sqrt(error_variance(rows, *inverse)) for rows in space.test_jacobians]
+    np.testing.assert_allclose(
+        per_pose, Knowledge.of_plan(robot, error_model, q, repetitions=2).accuracy(tests).per_pose
+    )
+
+
+def test_one_more_configuration_adds_what_is_said(case: tuple[Robot, ErrorModel]) -> None:
+    model, q = of(*case)
+    others, new = model.linearised(q[:5]), model.linearised(q[5:])
+    before = model.totals(q[:5], 5)[0]
+    for row, added in zip(q[5:], new.given(others), strict=True):
+        after = model.totals(np.vstack([q[:5], row]), 6)[0]
+        np.testing.assert_allclose(before + added.T @ added, after, rtol=0, atol=1e-9 * np.abs(after).max())
+
+
+def test_the_model_seen_from_a_design_has_the_same_information(case: tuple[Robot, ErrorModel]) -> None:
+    model, q = of(*case)
+    seen, extra = model.linearised(q).seen_from(np.ones(len(q)))
+    total, whole = extra + seen.model.at(q).sum(axis=0), model.totals(q, len(q))[0]
+    np.testing.assert_allclose(total, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
+
+
+def test_moments_change_with_the_joints_as_said() -> None:
+    for robot in (Robot.load("ur10e"), mixed()):
+        q, gravity, step = random_configurations(robot, 5), Gravity(), 1e-6
+        got = gravity.moment_gradients(Poses(robot, q))
+        moved = [(Poses(robot, q + step * e), Poses(robot, q - step * e)) for e in np.eye(q.shape[1])]
+        expected = [(gravity.moments(a) - gravity.moments(b)) / (2 * step) for a, b in moved]
+        np.testing.assert_allclose(got, np.stack(expected, axis=-1), atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_information_is_concave_in_the_design(seed: int) -> None:
+    """(B) at any design bounds the criterion of any plan, clusters and repetitions among them."""
+    problem = PlanProblem(kuka(), POSE, 6, error_model=typical(Isotropic(3e-5)))
+    space, rng = plan_space(problem), np.random.default_rng(seed)
+    criterion, model = space.search_criterion(), space.single
+    assert isinstance(model, ExtendedModel)
+    at = random_configurations(kuka(), 7, seed)
+    seen, extra = model.linearised(at).seen_from(rng.uniform(0.2, 2.0, len(at)))
+    counts = rng.uniform(0.2, 2.0, len(at))
+    seen, extra = model.linearised(at).seen_from(counts)
+    matrix = space.prior + extra + np.einsum("k,kij->ij", counts, seen.sums(1))
+    gradient = criterion.supporting_gradient(matrix)
+    assert np.sum(gradient * matrix) == pytest.approx(criterion.exact(matrix), rel=1e-9)
+    for spread in (0.0, 0.02, 0.3, 3.0):
+        q = POSE + spread * rng.standard_normal((6, 6))
+        reached = criterion.exact(model.totals(q, 6)[0] + space.prior)
+        bound = np.sum(gradient * (space.prior + extra)) + np.sum(seen.model.at(q) * gradient)
+        assert reached <= bound * (1 + 1e-9)
+
+
+def test_the_bound_of_a_design_is_not_beaten() -> None:
+    problem = PlanProblem(kuka(), POSE, 5, error_model=typical(Isotropic(3e-5)), search=FEW)
+    space = plan_space(problem)
+    design = approximate_design(
+        _design_problem(space, space.criterion("test_pose")), POSE[None], np.random.default_rng(0)
+    )
+    for spread in (0.0, 0.01, 0.1):
+        q = POSE + spread * np.random.default_rng(1).standard_normal((5, 6))
+        assert value_of(problem, q) ** -2 <= design.bound * (1 + 1e-6)
+    # The design that is best for one pose alone measures there: the gap is what its spread of 1e-4 costs, and the
+    # gap at which its rounds end.
+    assert value_of(problem, np.tile(POSE, (5, 1))) ** -2 == pytest.approx(design.bound, rel=0.05)
+
+
+def test_stops_spread_by_themselves() -> None:
+    """No two stops within the length of the joints' short functions, although nothing forbids it."""
+    model = with_wide_placement(typical(Isotropic(3e-5)))
+    found = plan(PlanProblem(kuka(("base", "tool")), POSE, 12, error_model=model, search=FEW))
+    q = found.configurations
+    apart = np.abs(q[:, None] - q[None]).max(axis=2) + 9.0 * np.eye(len(q))
+    assert apart.min() > 2 * model.values["short.length"]
+    assert found.quality.status == "ok"
+    assert found.quality.lower_bound <= found.quality.predicted_accuracy
+    told = Knowledge.of_plan(kuka(("base", "tool")), model, q).accuracy(POSE[None]).value
+    assert found.quality.predicted_accuracy == pytest.approx(told, rel=1e-6)
+    assert {t.name for t in found.quality.terms} == {
+        "placement",
+        "gravity",
+        "joint_functions",
+        "visits",
+        "points",
+    }
+    assert all(t.std < t.size for t in found.quality.terms if t.name in ("gravity", "joint_functions"))
+
+
+def test_candidates_are_exchanged_until_no_other_is_better() -> None:
+    """Two thirds of the candidates are copies of the others but for 0.5°: they are not taken beside them."""
+    robot, rng = kuka(), np.random.default_rng(0)
+    first = random_configurations(robot, 10, 5)
+    q = np.concatenate([first, first + 0.01, first - 0.01])
+    low, high = robot.joint_limits.T
+    q = np.clip(q, low, high)
+    model = replace(typical(Isotropic(3e-5)), visits=None)
+    problem = PlanProblem(robot, POSE, 5, error_model=model, candidates=Candidates(q), search=FEW)
+    space = plan_space(problem)
+    assert isinstance(space.model, ExtendedModel)
+    request = ChoiceProblem(
+        space.model.whitened(q), space.search_criterion(), space.prior, 5, together=space.model.linearised(q)
+    )
+    chosen = choose(request, rng)
+    assert len({row % 10 for row in chosen.rows.tolist()}) == 5
+    best = space.search_criterion().exact(_information(request, chosen.rows))
+    for position in range(5):
+        for other in range(len(q)):
+            rows = chosen.rows.copy()
+            rows[position] = other
+            if len(set(rows.tolist())) == 5:
+                assert space.search_criterion().exact(_information(request, rows)) <= best * (1 + 1e-3)
+    found = plan(problem)
+    assert found.quality.bound == "numerical"
+    assert found.quality.lower_bound <= found.quality.predicted_accuracy
+
+
+def test_a_prior_and_measurements_only_help() -> None:
+    robot, model = kuka(("base", "tool")), typical(Isotropic(3e-5))
+    q = random_configurations(robot, 12, 3)
+    problem = PlanProblem(robot, POSE, 8, error_model=model)
+    alone = value_of(problem, q[:8])
+    stated = replace(problem, prior=PlanPrior({"q1": 1e-5}))
+    assert value_of(stated, q[:8]) <= alone * (1 + 1e-9)
+    data = Measurements(robot.joint_names, q[8:], robot.positions(q[8:]))
+    assert value_of(replace(problem, prior=PlanPrior(measured=data)), q[:8]) < alone
+
+
+def test_flat_parameters_need_as_many_configurations_as_before() -> None:
+    model = replace(typical(Isotropic(3e-5)), placement=Placement("flat"))
+    scales = tuple(s for s in model.scales if not s.name.startswith("placement."))
+    with pytest.raises(InfeasibleError, match="at least 3"):
+        plan(PlanProblem(kuka(), POSE, 2, error_model=replace(model, scales=scales)))
