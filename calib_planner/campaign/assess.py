@@ -3,11 +3,19 @@
 The error of a visit to a test pose has two parts. What is not known of the robot, (M3), falls with the
 measurements. What is new at each visit, the robot's *repeatability*, stays: it is the *floor*. Both are the error
 model's, with the sizes that the measurements tell.
+
+The noise that a campaign is told is an expectation: by which factor it is wrong is a scale of the error model.
+The paper's model takes the noise for granted.
+
+A size σ is never known exactly: its logarithm has a standard deviation s. A visit errs by the mean of σ², which
+is σ² e^(2s²), and what that is more than σ² falls with the measurements as well. The *sure* part of the floor is
+what is left of it where every size is smaller by e^(3s); a robot that was hardly measured has little of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +23,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray
 from calib_planner.campaign.problem import CampaignProblem, Round
 from calib_planner.campaign.state import FIT, CampaignState
+from calib_planner.error_model import ErrorModel, typical
 from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.tracker import Isotropic, Noise
@@ -22,6 +31,10 @@ from calib_planner.units import cut, length
 
 FEWEST_SPARE = 10
 """Equations beyond the parameters from which an estimate can be judged."""
+SURE = 3.0
+"""Standard deviations of the logarithm of a scale within which it surely lies, looking after each batch."""
+WIDEST = 2.0
+"""A scale of which less is known than this counts as known so well: a factor of e² is nothing known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +52,12 @@ class Assessment:
     @cached_property
     def floor_per_test_pose(self) -> FloatArray:
         """(K,) repeatability there, root mean square distance over the targets [m]; it stays."""
-        told = self.estimate.knowledge.predict(self.estimate.accuracy.test_poses)
-        return np.asarray(np.sqrt(np.einsum("ktii->kt", told.repeatability).mean(axis=1)))
+        return self._repeatability(lambda spread: 0.0)
 
-    @property
+    @cached_property
     def accuracy_per_test_pose(self) -> FloatArray:
         """(K,) error of a visit: what is not known of the robot, and its repeatability [m]."""
-        return np.hypot(self.estimate.accuracy.predicted, self.floor_per_test_pose)
+        return np.hypot(self.estimate.accuracy.predicted, self._repeatability(lambda spread: spread**2))
 
     @property
     def accuracy(self) -> float:
@@ -57,11 +69,21 @@ class Assessment:
         """``floor_per_test_pose`` at the worst test pose [m]."""
         return float(np.max(self.floor_per_test_pose))
 
-    @property
+    @cached_property
     def surely(self) -> float:
-        """Lower limit of ``floor`` [m]: a variance from ν residuals is known to √(2/ν)."""
-        freedom = max(self.estimate.residuals.chi_square.freedom, 1)
-        return self.floor * float(np.sqrt(max(1.0 - 2.0 * np.sqrt(2.0 / freedom), 0.0)))
+        """The sure part of ``floor`` [m]."""
+        return float(np.max(self._repeatability(lambda spread: -SURE * spread)))
+
+    def _repeatability(self, change: Callable[[float], float]) -> FloatArray:
+        """(K,) at the test poses [m]; ``change``: of the logarithm of a scale, from its standard deviation."""
+        known, spread = self.estimate.knowledge, self.estimate.scale_spread
+        names = () if known.model.visits is None else known.model.visits.scales
+        values = {n: v for n, v in known.model.values.items() if n in names}
+        model = known.model.with_values(
+            {n: v * float(np.exp(change(min(spread.get(n, 0.0), WIDEST)))) for n, v in values.items()}
+        )
+        told = replace(known, model=model).predict(self.estimate.accuracy.test_poses).repeatability
+        return np.asarray(np.sqrt(np.trace(told, axis1=2, axis2=3).mean(axis=1)))
 
     @property
     def noise(self) -> Noise:
@@ -91,16 +113,25 @@ def assess(state: CampaignState) -> Assessment | None:
 
 def identification_problem(problem: CampaignProblem, data: Measurements) -> IdentificationProblem:
     """What is identified from ``data``; their own standard deviations go before the instrument's."""
-    instrument = None if data.std is not None else problem.instrument
-    alike = isinstance(instrument, Isotropic)
+    options = dict(problem.identification)
+    model = options.pop("error_model", None)
     return IdentificationProblem(
         problem.robot,
         data,
-        sigma=instrument.typical if instrument is not None and alike else None,
-        instrument=None if alike else instrument,
+        error_model=_with_expected_noise(typical() if model is None else model),
+        instrument=None if data.std is not None else problem.instrument,
         test_poses=problem.test_pose_array,
-        **problem.identification,
+        accuracy_frame=problem.accuracy_frame,
+        **options,
     )
+
+
+def _with_expected_noise(model: ErrorModel) -> ErrorModel:
+    """The model in which the stated noise may be wrong by a factor; the paper's stays."""
+    if model.is_papers or model.points.estimate_scale:
+        return model
+    factor = next(s for s in typical(estimate_scale=True).scales if s.name == "instrument")
+    return replace(model, points=replace(model.points, estimate_scale=True), scales=(*model.scales, factor))
 
 
 # ── Is it enough to judge by, enough altogether, or never enough? ────────────────────────────────────────────
@@ -109,16 +140,16 @@ def identification_problem(problem: CampaignProblem, data: Measurements) -> Iden
 def outcome_of(state: CampaignState, known: Assessment | None) -> tuple[str, str]:
     """A key of ``OUTCOMES`` and why; empty: go on."""
     problem, required = state.problem, f"{length(state.problem.required_accuracy)} required"
-    if known is not None and ready(state, known) and known.accuracy <= problem.required_accuracy:
+    if known is not None and ready(state, known) and known.accuracy <= problem.required_accuracy and sound(known):
         return "reached", f"{length(known.accuracy)} predicted, {required}"
     if state.given_up > problem.most_failures:
         reasons = sorted({e.reason for e in state.exclusions if not e.requested})
         return "unreachable", f"{state.given_up} configurations given up: {cut('; '.join(reasons), 300)}"
     if state.spent(FIT) >= problem.fit_budget:
-        now = "nothing identified" if known is None else f"{length(known.accuracy)} predicted"
-        return "budget_spent", f"{now}, {required}{_forecast_text(state, known)}"
+        return "budget_spent", f"{_now(state, known)}, {required}{_forecast_text(state, known)}"
     if known is not None and ready(state, known) and limited(state, known):
-        return "limited", f"{length(known.floor)} at a test pose are the robot's own, {required}"
+        surely = f"{length(known.floor)} of repeatability at a test pose, surely more than {length(known.surely)}"
+        return "limited", f"{surely}; {required}"
     return "", ""
 
 
@@ -126,8 +157,12 @@ def ready(state: CampaignState, known: Assessment) -> bool:
     """Whether there is enough to judge by."""
     apart = different(known.used)
     spare = 3 * int(apart.seen.sum()) - known.estimate.observability.rank
-    enough = len(apart) >= state.problem.minimum and spare >= FEWEST_SPARE
-    return enough and known.estimate.fit.status != "not_converged"
+    return len(apart) >= state.problem.minimum and spare >= FEWEST_SPARE
+
+
+def sound(known: Assessment) -> bool:
+    """Whether the measurements agree with the estimate: without that its predictions mean nothing."""
+    return known.estimate.verdict.level != "FAIL"
 
 
 def limited(state: CampaignState, known: Assessment) -> bool:
@@ -148,6 +183,17 @@ def forecast(known: Assessment, required: float) -> float:
         return float("inf")
     more = len(known.used) * (np.maximum(total**2 - floor**2, 0.0) / room - 1.0)
     return max(float(np.ceil(more.max() - 1e-9)), 0.0) + 0.0
+
+
+def _now(state: CampaignState, known: Assessment | None) -> str:
+    """What is known when the budget is spent."""
+    if known is None:
+        return "nothing identified"
+    if known.accuracy > state.problem.required_accuracy:
+        return f"{length(known.accuracy)} predicted"
+    if not ready(state, known):
+        return f"{length(known.accuracy)} predicted, by too few measurements to judge it"
+    return f"{length(known.accuracy)} predicted, but {known.estimate.verdict.reasons[0].text}"
 
 
 def _forecast_text(state: CampaignState, known: Assessment | None) -> str:

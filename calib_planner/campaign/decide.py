@@ -2,9 +2,10 @@
 
 For the fit, in this order:
 
-1. The error predicted of a visit to the worst test pose, see ``assess``, is what was required,
-   there are ``minimum`` configurations, and different ones give ``FEWEST_SPARE`` more equations than there are
-   parameters (repetitions cannot show that the model is wrong): **reached**.
+1. The error predicted of a visit to the worst test pose, see ``assess``, is what was required, there are
+   ``minimum`` configurations, different ones give ``FEWEST_SPARE`` more equations than there are parameters
+   (repetitions cannot show that the model is wrong), and the verdict on the estimate, which knows its left-out
+   error, is not FAIL: **reached**.
 2. More than ``most_failures`` configurations had to be given up: **unreachable**.
 3. No measurement is left but those of the validation: **budget_spent**.
 4. The robot's repeatability is surely more than required at a test pose even if nothing else were uncertain:
@@ -13,9 +14,10 @@ For the fit, in this order:
    measured.
 
 Then the validation. Good plans measure at few places, where a wrong model fits well enough; configurations that
-were chosen to lie elsewhere contradict it best. If they do (χ², see ``finish``) although the accuracy seemed to
-be reached, and if the budget allows, they join the fit, which goes on, and others are held out in the end. The
-validation that is reported is always of configurations that took no part in the fit.
+were chosen to lie elsewhere contradict it best. If they do (see ``finish``) although the accuracy seemed to be
+reached, they join the fit, which goes on, and others are held out in the end; where the budget does not allow
+that, the accuracy was not reached. The validation that is reported is always of configurations that took no part
+in the fit.
 
 The uncertain part ρ of the predicted error falls with 1/√N, its floor φ stays, so that what is required, ρ̄, takes
 
@@ -108,7 +110,8 @@ def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable
     total = len(queue) + len(twice)
     text = f"{total} measurements planned"
     made_round = round_of(state, known, total, text)
-    return NextStep(FIT, text, planned, (), (*queue, *reversed(twice)), round=made_round, left=left)
+    queue = (*queue, *reversed(twice))
+    return NextStep(FIT, text, planned, queue=queue, round=made_round, left=left)
 
 
 def plan_problem(state: CampaignState, known: Assessment | None) -> PlanProblem:

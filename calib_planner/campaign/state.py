@@ -65,12 +65,14 @@ class Measurement:
         index: Number of its configuration.
         q: (joints,) where the robot stood [rad | m].
         points: (targets, 3) [m]; NaN where a target was not seen.
+        std: (targets, 3) standard deviation of each coordinate [m]; ``None`` where nobody says it.
     """
 
     number: int
     index: int
     q: FloatArray
     points: FloatArray
+    std: FloatArray | None = None
 
 
 # ── what to do next ──────────────────────────────────────────────────────────────────────────────────
@@ -167,12 +169,14 @@ class CampaignState:
         return tuple(r for r in self.measurements if self.configurations[r.index].role == role)
 
     def data(self, role: str = FIT) -> Measurements | None:
-        """The same as the library's value, or ``None``."""
+        """The same as the library's value, or ``None``; with standard deviations if all have some."""
         rows = self.measurements_of(role)
         if not rows:
             return None
         q, points = np.array([r.q for r in rows]), np.array([r.points for r in rows])
-        return Measurements(self.problem.robot.joint_names, q, points)
+        stated = [r.std for r in rows if r.std is not None]
+        std = np.array(stated) if len(stated) == len(rows) else None
+        return Measurements(self.problem.robot.joint_names, q, points, std)
 
     def spent(self, role: str | None = None) -> int:
         """Measurements made, those that failed included; skipped and unreachable configurations cost none."""
@@ -203,12 +207,21 @@ class CampaignState:
 
     # ── events ───────────────────────────────────────────────────────────────────────────────────────
 
-    def measured(self, index: int, q: ArrayLike, points: ArrayLike, number: int | None = None) -> CampaignState:
+    def measured(
+        self,
+        index: int,
+        q: ArrayLike,
+        points: ArrayLike,
+        number: int | None = None,
+        std: ArrayLike | None = None,
+    ) -> CampaignState:
         """A configuration was measured; a measurement whose ``number`` is there already is replaced.
 
         Args:
             q: (joints,) where the robot stood [rad | m].
             points: (targets, 3) [m], NaN where a target was not seen; (3,) will do for one target.
+            std: Like ``points``: standard deviation of each coordinate [m]. Unless every point that was seen has
+                finite ones > 0, none of them counts.
 
         Raises:
             InputError: No such configuration, wrong shape, not a robot's numbers, no target seen at all.
@@ -229,7 +242,7 @@ class CampaignState:
             raise InputError("points", "NaN only", "at least one target that was seen", "report it as failed")
         if number is None:
             number = max((r.number for r in self.measurements), default=-1) + 1
-        row = Measurement(number, index, joints, clean)
+        row = Measurement(number, index, joints, clean, _stated(std, clean))
         if any(r.number == number for r in self.measurements):
             return replace(self, measurements=tuple(row if r.number == number else r for r in self.measurements))
         return replace(self, measurements=(*self.measurements, row), queue=_without_first(self.queue, index))
@@ -272,8 +285,6 @@ class CampaignState:
     def decided(self, step: NextStep) -> CampaignState:
         """Take in what ``decide`` returned."""
         planned = [replace(s, role=FIT) for s in self.configurations] if step.joins else list(self.configurations)
-        for index, more in step.again:
-            planned[index] = replace(planned[index], times=planned[index].times + more)
         return replace(
             self,
             configurations=(*planned, *step.configurations),
@@ -316,7 +327,6 @@ class NextStep:
         phase: Of the campaign from now on.
         message: What was decided, in words.
         configurations: New ones, numbered on from the state's.
-        again: ``(number, times)`` of configurations to be measured more often.
         queue: Numbers of the configurations to visit, in order.
         outcome: Why the fit ends, if it does.
         round: What is known now.
@@ -328,7 +338,6 @@ class NextStep:
     phase: str
     message: str
     configurations: tuple[PlannedConfiguration, ...] = ()
-    again: tuple[tuple[int, int], ...] = ()
     queue: tuple[int, ...] = ()
     outcome: str = ""
     round: Round | None = None
@@ -367,9 +376,10 @@ def from_measurements(
             for k in range(labels.max() + 1)
         ]
         state = replace(state, configurations=(*state.configurations, *planned))
-        for q, points, label in zip(ordered.q, ordered.p, labels, strict=True):
+        stated = [None] * len(ordered) if ordered.std is None else list(np.asarray(ordered.std))
+        for q, points, std, label in zip(ordered.q, ordered.p, stated, labels, strict=True):
             if not np.isnan(points).all():
-                state = state.measured(first + int(label), q, points)
+                state = state.measured(first + int(label), q, points, std=std)
     return replace(state, exclusions=exclusions)
 
 
@@ -378,3 +388,14 @@ def _without_first(queue: tuple[int, ...], index: int) -> tuple[int, ...]:
         return queue
     at = queue.index(index)
     return queue[:at] + queue[at + 1 :]
+
+
+def _stated(std: ArrayLike | None, points: FloatArray) -> FloatArray | None:
+    """``std`` as (targets, 3) [m], NaN where ``points`` are; ``None`` where it does not say all."""
+    if std is None:
+        return None
+    values = np.asarray(std, float).reshape(points.shape)
+    seen = ~np.isnan(points)
+    if not (np.isfinite(values[seen]) & (values[seen] > 0.0)).all():
+        return None
+    return frozen(np.where(seen, values, np.nan))

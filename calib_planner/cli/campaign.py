@@ -42,6 +42,7 @@ from calib_planner.cli.arguments import (
     test_poses,
 )
 from calib_planner.cli.terminal import Terminal, configurations_table
+from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError
 from calib_planner.io import (
     make_folder,
@@ -85,8 +86,10 @@ def add(commands: Commands, summary: str) -> None:
     wanted = parser.add_argument_group("what is wanted")
     add_test_poses(wanted, "where accuracy matters")
     add_test_path(wanted)
-    text = "largest error that is acceptable at a test pose [m]"
+    text = "largest error of a visit that is acceptable at a test pose, repeatability included [m]"
     option(wanted, "--required-accuracy", "A", text, kind=float, required=True)
+    text = "error in the frame of the points (world), or up to a rigid motion of the base (robot)"
+    option(wanted, "--accuracy-frame", None, text, DEFAULTS["accuracy_frame"], choices=ACCURACIES)
     work = parser.add_argument_group("what may be measured")
     for name, text in NUMBERS.items():
         option(work, f"--{name}", "N", text, DEFAULTS[name])
@@ -143,6 +146,7 @@ def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
         **{name: getattr(args, name) for name in NUMBERS},
         sigma=args.sigma,
         **conditions(args, robot),
+        accuracy_frame=args.accuracy_frame,
         identification={"error_model": read_error_model(args.error_model)},
         starts=args.starts,
         seed=args.seed,
@@ -249,7 +253,10 @@ def show_result(result: CampaignResult, achieved: FloatArray | None, console: Co
         f"{result.verdict.level}: {result.outcome.replace('_', ' ')}", style=STYLES[result.verdict.level]
     )
     console.print(f"{result.message}: {OUTCOMES[result.outcome]}.", soft_wrap=True)
+    said = {result.outcome}  # by the message
     for reason in (r for r in result.verdict.reasons if r.level != "PASS" or "test_pose" in r.code):
+        if reason.code in said:
+            continue
         advice = f" → {reason.advice}" if reason.advice else ""
         console.print(f"  {reason.level}  {reason.text}{advice}", soft_wrap=True)
     console.print(rounds_table(result.rounds))
@@ -262,7 +269,11 @@ def show_result(result: CampaignResult, achieved: FloatArray | None, console: Co
         )
     if achieved is not None:
         true = ", ".join(length(a) for a in achieved)
-        console.print(f"True error at the test poses: {true}; {length(result.accuracy)} predicted.")
+        predicted = "nothing" if estimate is None else length(estimate.accuracy.worst)
+        console.print(
+            f"True error at the test poses: {true} on average over visits; {predicted} predicted, "
+            f"{length(result.accuracy)} with the repeatability of a visit."
+        )
     console.print(f"{result.spent} of {counted(result.budget, 'measurement')} spent, "
                   f"{counted(len(result.exclusions), 'configuration')} given up.")  # fmt: skip
 
@@ -270,12 +281,14 @@ def show_result(result: CampaignResult, achieved: FloatArray | None, console: Co
 def rounds_table(rounds: Sequence[Round]) -> Table:
     """What was known after each batch."""
     table = Table(title="rounds")
-    for heading in ("#", "measured", "different", "predicted", "σ", "still needed", "planned"):
+    headings = ("#", "measured", "different", "predicted", "repeatability", "σ", "still needed", "planned")
+    for heading in headings:
         table.add_column(heading, justify="right")
     for r in rounds:
         known = np.isfinite(r.sigma)
         cells = [str(r.measured), str(r.configurations), length(r.accuracy) if known else "–"]
-        cells += [length(r.sigma) if known else "–", _left(r.left), str(r.planned)]
+        cells += [length(v) if known else "–" for v in (r.floor, r.sigma)]
+        cells += [_left(r.left), str(r.planned)]
         table.add_row(str(r.number), *cells)
     return table
 

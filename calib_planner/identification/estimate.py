@@ -12,7 +12,7 @@ what a URDF can hold: the parameters of a fit of placement alone, with its own l
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ from scipy.special import chdtrc, chdtri
 
 from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
 from calib_planner.error_model import Knowledge, to_mapping
+from calib_planner.identification.estimation import ModelEstimate
 from calib_planner.identification.term_gain import TermGain
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot
@@ -422,6 +423,7 @@ class Estimate:
         seconds: Time spent.
         validation: Statistics on held-out data, if any was given.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.
+        fits: The fits behind it, of all terms and of placement alone; an update begins with them.
     """
 
     calibrated: Robot
@@ -438,6 +440,15 @@ class Estimate:
     seconds: float
     validation: Validation | None = None
     verdict: Verdict = UNJUDGED
+    fits: tuple[ModelEstimate, ModelEstimate] | None = field(default=None, repr=False)
+
+    @property
+    def scale_spread(self) -> dict[str, float]:
+        """Scale of the error model that the data decide → standard deviation of its logarithm."""
+        if self.fits is None:
+            return {}
+        names, covariance = self.fits[0].origin.scales
+        return dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
     def positions(self, q: ArrayLike) -> FloatArray:
         """Where the targets are on average, by all terms: (N, joints) → (N, targets, 3) [m]."""

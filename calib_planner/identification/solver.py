@@ -311,6 +311,7 @@ def _estimate(
         placement_alone=_left_out_error(alone.left_out, alone, source),
         terms=fit.terms,
         seconds=time.perf_counter() - began,
+        fits=(fit, alone),
     )
     return judged(estimate)
 

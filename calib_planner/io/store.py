@@ -699,6 +699,9 @@ JOIN = f"""
 """
 
 
+StoredRow = tuple[int, str, list[float], list[Any], list[Any]]
+
+
 @dataclass(frozen=True, eq=False)
 class StoredCampaign:
     """What the record of a campaign holds.
@@ -706,8 +709,8 @@ class StoredCampaign:
     Attributes:
         store: The open file.
         campaign_id: Name of the campaign.
-        rows: ``(number, role, configuration, points)`` of each measurement in use: (joints,) [rad | m] and
-            (targets, 3) [m], ``None`` where a target was not seen.
+        rows: ``(number, role, configuration, points, std)`` of each measurement in use: (joints,) [rad | m],
+            (targets, 3) [m] and (targets,) [m], ``None`` where a target was not seen or nobody said how well.
         exclusions: Configurations given up.
         finished: The outcome; empty while it is not ended.
         fit_plan: Name and plan of the fit that the identifier took last; ``None`` if there is none that holds the
@@ -716,7 +719,7 @@ class StoredCampaign:
 
     store: CampaignStore
     campaign_id: str
-    rows: tuple[tuple[int, str, list[float], list[Any]], ...] = ()
+    rows: tuple[StoredRow, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     finished: str = ""
     fit_plan: tuple[str, Plan] | None = None
@@ -754,7 +757,9 @@ class CampaignStore(Store):
         for number, row in now.items():
             if then.get(number) is not row:
                 event = {"measured": number, "role": after.configurations[row.index].role}
-                events.append(event | {"configuration": row.q.tolist(), "points": plain(row.points)})
+                std = None if row.std is None else row.std.max(axis=1)  # coordinates of one standstill are alike
+                event |= {"configuration": row.q.tolist(), "points": plain(row.points), "std": plain(std)}
+                events.append(event)
         for e in after.exclusions[len(before.exclusions) :]:
             event = {"excluded": e.q.tolist(), "radius": e.radius, "reason": e.reason[:LONGEST]}
             events.append(event | {"asked": e.requested})
@@ -792,8 +797,9 @@ class CampaignStore(Store):
                 if role not in (FIT, VALIDATION):
                     raise InputError("role", cut(role, 100), f"{FIT} or {VALIDATION}")
                 q, points = np.array(event["configuration"], float), np.array(event["points"], float)
-                unknown = np.full(self.model.targets, np.nan)
-                stood = Standstill(0, 0, q, points, unknown, np.zeros(self.model.targets, np.int64))
+                unknown, said = np.full(self.model.targets, np.nan), event.get("std")
+                std = unknown if said is None else np.array(said, float)
+                stood = Standstill(0, 0, q, points, std, np.zeros(self.model.targets, np.int64))
                 number = _insert(write, "standstills", standstill_row(stood, "") | {"told": told})
                 _decide(write, campaign, number, Record(stood, ACCEPTED, "", None, 0), role)
             elif "withdrawn" not in event:
@@ -807,14 +813,15 @@ class CampaignStore(Store):
         current = self._one(CURRENT)
         if current is None:
             return None
-        rows: list[tuple[int, str, list[float], list[Any]]] = []
+        rows: list[StoredRow] = []
         path, joints = self.path or "memory", len(self.model.joint_names)
         sql = "SELECT document FROM events WHERE campaign = ? ORDER BY number"
         with _readable(path):
             for row in self._rows(LATEST, current["number"]):
                 if row["status"] == ACCEPTED:
                     stood = record_of(path, row, joints, self.model.targets).standstill
-                    rows.append((row["told"], row["role"], stood.joints.tolist(), plain(stood.points)))
+                    points, std = plain(stood.points), plain(stood.std)
+                    rows.append((row["told"], row["role"], stood.joints.tolist(), points, std))
             _measurements(self.model.joint_names, rows)  # refuses what is no measurement
             exclusions, finished, fit_plan = [], "", None
             for event in (json.loads(row["document"]) for row in self._rows(sql, current["number"])):
@@ -900,13 +907,15 @@ def _model(robot: Robot) -> StoredModel:
     return StoredModel(robot.name, robot.joint_names, len(robot.targets), "")
 
 
-def _measurements(
-    joint_names: tuple[str, ...], rows: Sequence[tuple[int, str, list[float], list[Any]]]
-) -> Measurements | None:
+def _measurements(joint_names: tuple[str, ...], rows: Sequence[StoredRow]) -> Measurements | None:
+    """With standard deviations if they are known of all points."""
     if not rows:
         return None
-    points = np.array([r[3] for r in rows], float)  # None becomes NaN
-    return Measurements(joint_names, np.array([r[2] for r in rows], float), points)
+    points, std = np.array([r[3] for r in rows], float), np.array([r[4] for r in rows], float)  # None: NaN
+    seen = ~np.isnan(points[:, :, 0])
+    each = np.where(seen[:, :, None], std[:, :, None], np.nan) * np.ones(3)
+    known = bool((std[seen] > 0.0).all())
+    return Measurements(joint_names, np.array([r[2] for r in rows], float), points, each if known else None)
 
 
 @contextmanager

@@ -246,9 +246,9 @@ class Measuring:
         plan = self._plans.get(message.plan_id)
         if known or plan is None or message.configuration_index >= len(plan.numbers):
             return state
-        points = np.array([[p.x, p.y, p.z] for p in message.points])
-        number = plan.numbers[message.configuration_index]
-        return state.measured(number, _joints(message, state), points, int(message.id))
+        points, std = (np.array([[v.x, v.y, v.z] for v in many]) for many in (message.points, message.std))
+        number, q = plan.numbers[message.configuration_index], _joints(message, state)
+        return state.measured(number, q, points, int(message.id), std if std.shape == points.shape else None)
 
     def _rejected(self, message: Measurement) -> None:
         visit = self.visit

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import repeats
-from worlds import POSE, SIGMA, achieved, campaign, kuka, planar, world_of
+from worlds import PAPER, POSE, SIGMA, TYPICAL, achieved, campaign, kuka, planar, world_of
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, UnknownNameError, identify, plan
-from calib_planner.campaign import CampaignProblem, Measure, begin, decide, run_campaign
+from calib_planner.campaign import (
+    VALIDATION,
+    CampaignProblem,
+    CampaignResult,
+    CampaignState,
+    Measure,
+    begin,
+    decide,
+    from_measurements,
+    run_campaign,
+)
+from calib_planner.campaign.assess import assess
 from calib_planner.campaign.finish import APART
+from calib_planner.error_model import typical
 from calib_planner.identification import IdentificationProblem
 from calib_planner.planning import Search, plan_for_accuracy
 from calib_planner.simulation import simulated
+from calib_planner.units import length
 
 
-def test_twenty_robots_are_as_good_as_predicted():
+def test_a_dozen_robots_are_as_good_as_predicted():
     """Achieved within three times predicted for each, and of the right size for all together."""
     ratios, used = [], []
-    for seed in range(20):
-        problem = planar(seed=seed, validation=0)
+    for seed in range(12):
+        problem = planar(seed=seed, validation=0, starts=2)
         world = world_of(problem.robot, seed)
         result = campaign(problem, world)
         assert result.outcome == "reached" and result.accuracy <= problem.required_accuracy
@@ -58,7 +73,7 @@ def test_the_result_is_that_of_its_measurements():
     problem = kuka(seed=3)
     result = campaign(problem, world_of(problem.robot, 3))
     again = identify(
-        IdentificationProblem(problem.robot, result.fit, SIGMA, loss="robust", test_poses=POSE),
+        IdentificationProblem(problem.robot, result.fit, SIGMA, PAPER["error_model"], test_poses=POSE)
     )
     np.testing.assert_allclose(again.fit.deviations, result.estimate.fit.deviations, rtol=0, atol=1e-12)
     assert result.verdict.level in ("PASS", "WARN")
@@ -77,50 +92,151 @@ def test_same_seed_same_campaign():
     assert results[0].to_dict()["rounds"] == results[1].to_dict()["rounds"]
 
 
-@pytest.mark.parametrize("seed", repeats([1], [0, 1]))
+@pytest.mark.parametrize("seed", repeats([1], [0, 1, 2, 3]))
 def test_more_noise_than_stated_is_noticed_and_measured_away(seed):
-    plain = campaign(planar(10e-6, seed, budget=200), world_of(planar().robot, seed))
-    world = world_of(planar().robot, seed, sigma=2 * SIGMA)
-    noisy = campaign(planar(10e-6, seed, budget=200), world)
-    assert noisy.outcome == "reached" and noisy.rounds[-1].scatter == "noise"
-    assert noisy.rounds[-1].sigma == pytest.approx(2 * SIGMA, rel=0.3)
-    assert noisy.rounds[-1].measured > 2 * plain.rounds[-1].measured
-    assert achieved(noisy, world, planar().test_pose_array) < 3 * noisy.accuracy
+    def result(sigma: float) -> CampaignResult:
+        problem = planar(60e-6, seed, budget=200, identification=TYPICAL)
+        return campaign(problem, world_of(problem.robot, seed, sigma))
+
+    plain, noisy = result(SIGMA), result(3 * SIGMA)
+    assert plain.outcome == noisy.outcome == "reached"
+    assert noisy.rounds[-1].sigma == pytest.approx(3 * SIGMA, rel=0.3)
+    assert len(noisy.fit) > 1.5 * len(plain.fit)
 
 
 def test_less_noise_than_stated_saves_measurements():
-    world = world_of(planar().robot, 1, sigma=0.3 * SIGMA)
-    result = campaign(planar(8e-6, 1), world)
-    honest = campaign(planar(8e-6, 1), world_of(planar().robot, 1))
-    assert result.outcome == "reached" and result.rounds[-1].measured < 0.6 * honest.rounds[-1].measured
-    assert achieved(result, world, planar().test_pose_array) < 3 * result.accuracy
+    def result(sigma: float) -> CampaignResult:
+        problem = planar(30e-6, 1, budget=200, identification=TYPICAL)
+        return campaign(problem, world_of(problem.robot, 1, sigma))
+
+    quiet, honest = result(0.3 * SIGMA), result(SIGMA)
+    assert quiet.outcome == "reached" and len(quiet.fit) < 0.6 * len(honest.fit)
+    assert quiet.rounds[-1].sigma < 0.5 * SIGMA
 
 
 @pytest.mark.parametrize("seed", repeats([1], [1, 2]))
-def test_errors_of_the_joints_are_learnt_or_named(seed):
-    """0.4 mrad in every joint: with corrections the accuracy is reached in truth; without, it says why not."""
+def test_errors_of_the_joints_are_learnt_and_never_denied(seed):
+    """0.4 mrad in every joint: they are learnt, or, by a model without them, the accuracy is not reached."""
     world = world_of(kuka().robot, seed, transmission=4e-4)
-    learnt = campaign(kuka(60e-6, seed, budget=120), world)
-    assert learnt.estimate.transmission is not None
+    learnt = campaign(kuka(150e-6, seed, budget=120, identification=TYPICAL), world)
+    assert {"smooth", "short"} & {t.name for t in learnt.estimate.terms if t.kept}
     assert learnt.outcome == "reached" and learnt.verdict.level != "FAIL"
-    assert achieved(learnt, world, POSE) < 3 * learnt.accuracy
-    off = kuka(60e-6, seed, budget=120, identification={"joint_corrections": "off"})
-    stopped = campaign(off, world)
-    assert stopped.outcome == "limited" and stopped.verdict.level == "FAIL"
-    assert stopped.spent < 0.6 * off.budget
-    assert stopped.rounds[-1].floor > 60e-6 and "robot's own" in stopped.message
+    assert achieved(learnt, world, POSE) < 150e-6
+    stopped = campaign(kuka(60e-6, seed, budget=60), world)
+    assert stopped.outcome == "budget_spent" and stopped.verdict.level == "FAIL"
 
 
-def test_repetitions_tell_noise_from_the_robot():
-    """The same residuals, once as noise and once as a wrong model."""
-    notes = {}
+def test_noise_is_measured_away_and_repeatability_is_not():
+    """The same size of scatter: of the points, or of the visits."""
+    visits = typical().with_values({"repeatability": 2e-4})
+    visits = replace(visits, gravity=None, joint_functions=None)
+    outcomes = {}
     for name, world in (
         ("noise", world_of(planar().robot, 5, sigma=4 * SIGMA)),
-        ("robot", world_of(planar().robot, 5, transmission=2e-4)),
+        ("visits", world_of(planar().robot, 5, model=visits)),
     ):
-        problem = planar(10e-6, 5, budget=60, identification={"joint_corrections": "off"})
-        notes[name] = {r.scatter for r in campaign(problem, world).rounds}
-    assert "discrepancy" in notes["robot"] and "discrepancy" not in notes["noise"] and "noise" in notes["noise"]
+        result = campaign(planar(100e-6, 5, budget=200, identification=TYPICAL), world)
+        outcomes[name] = result.outcome
+    assert outcomes == {"noise": "reached", "visits": "limited"}
+    assert "of repeatability" in result.message and result.spent < 100
+    assert result.floor > 100e-6 and result.accuracy >= result.floor
+
+
+@pytest.mark.parametrize("seed", repeats([1], range(6)))
+def test_a_robot_as_they_are_ends_sensibly(seed):
+    """A true robot drawn from the typical error model: reached in truth, or limited by its repeatability."""
+    problem = kuka(300e-6, seed, identification=TYPICAL)
+    world = world_of(problem.robot, seed, model=typical())
+    result = campaign(problem, world)
+    assert result.outcome == "reached" and result.accuracy <= 300e-6
+    assert result.verdict.level != "FAIL"
+    assert achieved(result, world, POSE) < 1.5 * problem.required_accuracy
+    limited = campaign(kuka(20e-6, seed, identification=TYPICAL), world)
+    assert limited.outcome == "limited" and "of repeatability" in limited.message
+    assert limited.floor > 20e-6 and limited.verdict.level == "FAIL" and limited.spent < 40
+
+
+# ── a campaign does not contradict itself ────────────────────────────────────────────────────────────
+
+
+def displaced(problem: CampaignProblem, seed: int, at: str, by: float) -> CampaignResult:
+    """A campaign in which what is measured for ``at`` lies ``by`` elsewhere [m]."""
+    measure = simulated(world_of(problem.robot, seed), seed)
+    return run_campaign(problem, lambda a: measure(a) + (by if a.role == at else 0.0))
+
+
+@pytest.mark.parametrize(
+    ("identification", "budget"), [(PAPER, 40), (TYPICAL, 18), (TYPICAL, 30)], ids=["paper", "spent", "left"]
+)
+def test_a_validation_that_says_otherwise_is_believed(identification, budget):
+    """60 µm required, 0.5 mm on the validation: not reached, whether or not there is budget to go on."""
+    problem = planar(60e-6, 1, budget=budget, identification=identification)
+    result = displaced(problem, 1, VALIDATION, 5e-4)
+    assert result.outcome != "reached" and result.verdict.level == "FAIL"
+    assert result.estimate.validation.rms > 3 * problem.required_accuracy
+    first = result.verdict.reasons[0]
+    assert first.level == "FAIL" and first.text == result.message
+    assert result.spent <= budget
+
+
+def test_a_reached_campaign_says_nothing_else():
+    """Outcome, message, verdict and numbers agree, whatever the robot is like."""
+    for seed in range(4):
+        problem = planar(80e-6, seed, budget=30, identification=TYPICAL)
+        result = campaign(problem, world_of(problem.robot, seed, model=typical()))
+        assert (result.outcome == "reached") == (result.verdict.level != "FAIL")
+        if result.outcome == "reached":
+            assert result.accuracy <= problem.required_accuracy
+        else:
+            assert result.message in [r.text for r in result.verdict.reasons]
+        (reason,) = (r for r in result.verdict.reasons if r.code == "required_accuracy")
+        assert length(result.accuracy) in reason.text
+        assert result.accuracy >= result.estimate.accuracy.worst
+
+
+def test_a_validation_that_is_sound_seldom_contradicts():
+    """The probability of a contradiction is that of its threshold, with errors that poses share counted once."""
+    joined = []
+    for seed in range(8):
+        problem = planar(60e-6, seed, identification=TYPICAL)
+
+        def watch(state: CampaignState) -> None:
+            joined.append("join the fit" in state.message)
+
+        run_campaign(problem, simulated(world_of(problem.robot, seed), seed), watch)
+    assert not any(joined)
+
+
+def test_the_standard_deviations_of_the_samples_reach_the_fit():
+    """Points that came with small ones weigh more; they are there after a restart and in every identification."""
+    problem = planar(identification=TYPICAL)
+    measure, state = simulated(world_of(problem.robot, 2), 2), begin(problem)
+    state = state.decided(decide(state))
+    rng = np.random.default_rng(0)
+    while isinstance(state.action, Measure):
+        action, std = state.action, np.full((1, 3), rng.uniform(5e-6, 5e-5))
+        state = state.measured(action.index, action.q, measure(action), std=std)
+    data = state.data()
+    assert np.ptp(data.std) > 2e-5
+    known = assess(state)
+    np.testing.assert_array_equal(known.problem.data.std, data.std)
+    assert known.estimate.noise.source == "data"
+    again = from_measurements(problem, data)
+    np.testing.assert_array_equal(sorted(again.data().std[:, 0, 0]), sorted(data.std[:, 0, 0]))
+    without = from_measurements(problem, replace(data, std=None))
+    assert assess(without).estimate.noise.source == "instrument"
+    unlike = assess(without).estimate.fit.deviations - known.estimate.fit.deviations
+    assert np.abs(unlike).max() > 1e-7
+
+
+def test_a_standard_deviation_that_says_nothing_counts_for_none():
+    problem = planar()
+    state = begin(problem).decided(decide(begin(problem)))
+    action = state.action
+    for std in (np.zeros((1, 3)), np.full((1, 3), np.nan), [[1e-5, 1e-5, np.inf]]):
+        assert state.measured(action.index, action.q, [0.5, 0.5, 0.0], std=std).data().std is None
+    kept = state.measured(action.index, action.q, [0.5, 0.5, 0.0], std=[1e-5, 1e-5, 2e-5])
+    assert kept.data().std.tolist() == [[[1e-5, 1e-5, 2e-5]]]
 
 
 # ── what cannot be measured ──────────────────────────────────────────────────────────────────────────
@@ -161,7 +277,7 @@ def test_targets_that_are_never_seen_use_up_the_budget_or_the_failures():
 
 
 def test_gross_errors_are_left_out():
-    problem = kuka(15e-6, 2)
+    problem = kuka(60e-6, 2, identification=TYPICAL)
     world = world_of(problem.robot, 2)
     measure = simulated(world, 2)
     count = 0

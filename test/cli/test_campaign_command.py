@@ -16,7 +16,8 @@ from calib_planner.measurements import Measurements
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 POSE = ["--test-pose", "0.17453 0.87266"]
-BASE = ["campaign", "--robot", "planar_2r", *POSE, "--required-accuracy", "12e-6", "--starts", "4"]
+SEARCH = ["--starts", "4"]
+BASE = ["campaign", "--robot", "planar_2r", *POSE, "--required-accuracy", "120e-6", *SEARCH]
 KEYS = {"outcome", "message", "rounds", "verdict", "estimate", "measurements", "validation_measurements", "spent"}
 
 
@@ -29,8 +30,9 @@ def test_simulated(tmp_path: Path, capsys: Any) -> None:
     status, out, err = call(capsys, *BASE, "--simulate", "3", "--json", "--output", str(tmp_path / "new"))
     found = json.loads(out)
     assert status == 0 and "new" in err and set(found) >= KEYS
-    assert found["outcome"] == "reached" and found["predicted_accuracy"] <= 12e-6
-    assert found["achieved_per_test_pose"][0] < 3 * found["predicted_accuracy"]
+    assert found["outcome"] == "reached" and found["predicted_accuracy"] <= 120e-6
+    assert found["repeatability"] < found["predicted_accuracy"]
+    assert found["achieved_per_test_pose"][0] < 120e-6
     assert [r["number"] for r in found["rounds"]] == list(range(len(found["rounds"])))
     robot = Robot.load("planar_2r")
     fit = read_measurements(tmp_path / "new" / "measurements.csv", robot).data
@@ -48,14 +50,27 @@ def test_simulated(tmp_path: Path, capsys: Any) -> None:
 def test_the_tables(capsys: Any) -> None:
     status, out, err = call(capsys, *BASE, "--simulate", "1")
     assert status == 0 and not err
-    assert out.startswith(("PASS: reached", "WARN: reached")) and "rounds" in out and "as stated" in out
+    assert out.startswith(("PASS: reached", "WARN: reached")) and "rounds" in out and "repeatability" in out
     assert "True error at the test poses" in out and "Validation on 6 points" in out
 
 
 def test_more_noise_than_stated_is_said(capsys: Any) -> None:
-    options = ("--simulate", "1", "--simulate-sigma", "9e-5", "--budget", "30")
+    options = ("--simulate", "1", "--simulate-sigma", "1.5e-4", "--budget", "30")
+    status, out, _ = call(capsys, *BASE, *options, "--simulate-error-model", "paper", "--json")
+    found = json.loads(out)
+    assert status == 0 and found["rounds"][-1]["sigma"] > 7e-5
+
+
+def test_a_robot_that_does_not_repeat_is_said_to_be_the_limit(capsys: Any) -> None:
+    options = ("--required-accuracy", "5e-6", "--simulate", "1", "--simulate-error-model", "typical")
     status, out, _ = call(capsys, *BASE, *options)
-    assert status == 0 and out.startswith("FAIL: budget spent") and "noise, as repeated" in out
+    assert status == 0 and out.startswith("FAIL: limited\n") and "of repeatability at a test pose" in out
+    assert out.count("of repeatability at a test pose") == 1  # the verdict does not say it once more
+
+
+def test_the_accuracy_frame_is_said_or_refused(capsys: Any) -> None:
+    status, _, err = call(capsys, *BASE, "--simulate", "1", "--accuracy-frame", "robot")
+    assert status == 2 and "test_poses" in err and "world" in err
 
 
 def test_by_hand_until_it_is_done(tmp_path: Path, capsys: Any) -> None:
@@ -82,7 +97,7 @@ def test_by_hand_until_it_is_done(tmp_path: Path, capsys: Any) -> None:
         write_measurements(files[role], data[role])
         options = ["--measured", str(files["fit"])]
         options += ["--held-out", str(files["validation"])] if "validation" in data else []
-    assert found["outcome"] == "reached" and found["predicted_accuracy"] <= 12e-6
+    assert found["outcome"] == "reached" and found["predicted_accuracy"] <= 120e-6
     assert len(data["validation"]) == 6 and found["verdict"]["level"] in ("PASS", "WARN")
 
 

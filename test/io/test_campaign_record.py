@@ -40,7 +40,7 @@ def noted(folder: Path) -> tuple[CampaignStore, CampaignState]:
     """Four visits for the fit, two for validation; one undone, one given up."""
     store = begin_campaign(folder, "abc", PROBLEM, "1.2.3")
     stops = tuple(PlannedConfiguration(q, FIT if k < 4 else VALIDATION) for k, q in enumerate(Q))
-    state = begin(PROBLEM).decided(NextStep(FIT, "", stops, (), (0, 1, 2, 3, 4, 5)))
+    state = begin(PROBLEM).decided(NextStep(FIT, "", stops, queue=(0, 1, 2, 3, 4, 5)))
     events = [
         lambda s: s.measured(0, Q[0], POINTS[0], 11),
         lambda s: s.measured(1, Q[1], POINTS[1], 12),
@@ -105,8 +105,36 @@ def test_a_measurement_told_again_replaces_the_former(tmp_path: Path) -> None:
     store.note(state, state.measured(3, Q[3], POINTS[5], 14))
     store.close()
     with reopened(tmp_path) as stored:
-        assert sorted((n, points) for n, _, _, points in stored.rows if n == 14) == [(14, POINTS[5].tolist())]
+        assert sorted((n, points) for n, _, _, points, _ in stored.rows if n == 14) == [(14, POINTS[5].tolist())]
         assert len(stored.rows) == 3
+
+
+def test_standard_deviations_come_back_to_the_bit(tmp_path: Path) -> None:
+    """Those of the samples of a standstill; of a campaign in which one measurement has none, none."""
+    robot = ROBOT.with_targets(np.zeros((2, 3)))
+    problem = CampaignProblem(robot, [0.2, 0.9], 1e-5)
+    store = begin_campaign(tmp_path, "abc", problem, "1.2.3")
+    stops = tuple(PlannedConfiguration(q, FIT) for q in Q)
+    state = begin(problem).decided(NextStep(FIT, "", stops, queue=tuple(range(6))))
+    rng = np.random.default_rng(2)
+    for k in range(3):
+        points = np.repeat(POINTS[k], 2, axis=0)
+        if k == 1:
+            points[1] = np.nan
+        std = np.repeat(rng.uniform(1e-6, 1e-4, (2, 1)), 3, axis=1)
+        after = state.measured(k, Q[k], points, k + 1, std)
+        store.note(state, after)
+        state = after
+    store.close()
+    stored = open_campaign(tmp_path, robot)
+    np.testing.assert_array_equal(stored.state(problem).data().std, state.data().std)
+    assert np.isnan(state.data().std[1, 1]).all()
+    after = state.measured(3, Q[3], np.repeat(POINTS[3], 2, axis=0), 4)
+    stored.store.note(state, after)
+    stored.store.close()
+    again = open_campaign(tmp_path, robot)
+    assert after.data().std is None and again.state(problem).data().std is None
+    again.store.close()
 
 
 def test_a_validation_that_joined_the_fit_is_part_of_it(tmp_path: Path) -> None:
@@ -152,7 +180,7 @@ def test_a_write_torn_at_any_byte_leaves_whole_events(tmp_path: Path) -> None:
         with reopened(folder) as stored:
             numbers = tuple(number for number, *_ in stored.rows)
             assert numbers in possible and (cut < len(log) or numbers == possible[-1])
-            for number, _, q, points in stored.rows:
+            for number, _, q, points, _ in stored.rows:
                 if number >= 16:
                     assert q == Q[5].tolist() and points == (POINTS[5] + (number - 16)).tolist()
             stored.store.note(state, state.measured(5, Q[5], POINTS[5], 99))

@@ -334,7 +334,7 @@ def test_a_folder_of_the_version_before_is_read_whole(tmp_path: Path) -> None:
         np.random.default_rng(0).uniform(-1.5, 1.5, (6, 2)),
         np.random.default_rng(1).normal(size=(6, 1, 3)),
     )
-    for (_, _, configuration, measured), k in zip(stored.rows, (0, 3, 4), strict=True):
+    for (_, _, configuration, measured, _), k in zip(stored.rows, (0, 3, 4), strict=True):
         assert configuration == q[k].tolist() and measured == (points[k] / 3.0).tolist()
     assert [(e.q.tolist(), e.reason, e.requested) for e in stored.exclusions] == [
         (q[2].tolist(), "a wall", False)
