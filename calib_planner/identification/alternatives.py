@@ -69,10 +69,12 @@ SUSPICIOUS = 1e-2
 """The same from which on an alternative is fitted in full."""
 MATERIAL = 1.0
 """Predicted standard deviations: a prediction that moves by less errs no more than was promised."""
-MOST_CUTS = 120
-"""Cuts between visits that are tried at once; of more visits the neighbourhood of the best is tried anew."""
-MOST_FITS = 5
-"""Suspicious alternatives that are fitted in full, the most suspicious ones."""
+MOST_CUTS, FEW_CUTS = 150, 40
+"""Cuts between visits that are tried at once, and the same for more than twice ``ENOUGH`` coordinates; the
+neighbourhood of the best is tried anew. Of so many no run of visits is looked for, scales are those of the
+estimate, and one alternative is named."""
+MOST_FITS, FEW_FITS = 5, 2
+"""Suspicious alternatives that are fitted in full, the most suspicious ones; and the same for so many."""
 MOST_FINDINGS = 3
 """Alternatives that are named."""
 ABSORBED = 1e-9
@@ -426,6 +428,11 @@ class _Fine:
         yield from self._runs(solution)
         yield from self._priors(solution)
 
+    @property
+    def _many(self) -> bool:
+        """Whether the scales of the estimate come from some of the visits alone."""
+        return self.problem.y.size > 2 * ENOUGH
+
     @cached_property
     def _stations(self) -> list[FloatArray]:
         """Columns of a motion of the station, here and at the test poses."""
@@ -473,7 +480,7 @@ class _Fine:
 
     def _runs(self, solution: Solution) -> Iterator[_Question]:
         """The most suspicious run of visits."""
-        station, run = self._stations, shifted_run(solution)
+        station, run = self._stations, None if self._many else shifted_run(solution)
         if run is None:
             return
         first, last = int(run[0]), int(run[-1]) + 1
@@ -522,7 +529,7 @@ class _Fine:
             if told is not None:
                 named, base = named + 1, told[1]
                 yield told[0]
-        for _ in range(MOST_FINDINGS - named):
+        for _ in range((1 if self._many else MOST_FINDINGS) - named):
             fits = [self._fitted_in_full(a, d, base) for a, d in self._suspicious(base)]
             better = [f for f in fits if f is not None]
             if not better:
@@ -534,7 +541,7 @@ class _Fine:
         """Answers below ``SUSPICIOUS`` with the doubt they need: the best of each kind and joint, few of them."""
         lifted = self._lifted(base.doubt)
         doubts = [base.doubt] if (lifted == base.doubt).all() else [base.doubt, lifted]
-        usual = _usual(base.problem)
+        usual = base.problem if self._many else _usual(base.problem)
         problems = [base.problem] if usual is base.problem else [base.problem, usual]
         chosen: dict[tuple[Any, ...], tuple[_Answer, FloatArray]] = {}
         for doubt in doubts:
@@ -554,7 +561,7 @@ class _Fine:
                         key not in chosen or _order(answer) < _order(chosen[key][0])
                     ):
                         chosen[key] = (answer, doubt)
-        return sorted(chosen.values(), key=lambda a: _order(a[0]))[:MOST_FITS]
+        return sorted(chosen.values(), key=lambda a: _order(a[0]))[: FEW_FITS if self._many else MOST_FITS]
 
     def _solved(self, problem: LinearProblem, doubt: FloatArray) -> Solution:
         """The solution with these doubts; the one at hand if nothing differs."""
@@ -678,9 +685,9 @@ class _Fine:
 
     def _settled(self, problem: LinearProblem, doubt: FloatArray) -> tuple[Solution, FloatArray]:
         """The solution with new scales; points that are possible now count, and those that are not do not."""
-        papers, many = problem.model.is_papers, problem.y.size > ENOUGH
+        papers = problem.model.is_papers
         for _ in range(1 if papers else DOUBT_ROUNDS):
-            solution = solve(problem) if many else maximise(problem, SCALE_ROUNDS)
+            solution = solve(problem) if self._many else maximise(problem, SCALE_ROUNDS)
             new = doubt if papers else impossible(solution, doubt)
             if ((new > 0) == (doubt > 0)).all():
                 break
