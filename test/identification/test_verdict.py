@@ -7,30 +7,39 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cells import POSE, ROUND, SIGMA, WrongRobot, bare, placed_cell, plain_cell, spoil
-from robots import random_configurations
+from cells import SIGMA, WrongRobot, bare, placed_cell, plain_cell, spoil
+from robots import random_configurations, repeats
+from scipy.stats import binom
 
-from calib_planner import IdentificationProblem, Robot, identify, validate
-from calib_planner.error_model import ErrorModel, typical
-from calib_planner.identification import LEVELS, RULES, cross_validate, judged
+from calib_planner import IdentificationProblem, Measurements, Robot, identify, validate
+from calib_planner.error_model import ErrorModel, Truth, typical
+from calib_planner.identification import LEVELS, RULES, judged
 from calib_planner.measurements import RejectedPoint
-from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.simulation import SimulatedCell
+from calib_planner.tracker import Isotropic
 
 KUKA = Robot.load("kuka_kr270")
+PAPER = ErrorModel.paper()
+POSES = random_configurations(KUKA, 2, 6)
 
 
-def data_of(seed: int = 1, count: int = 25, repetitions: int = 1):
+def data_of(seed: int = 1, count: int = 25):
     cell, _ = plain_cell(seed)
-    return bare(cell.measure(random_configurations(KUKA, count, seed), repetitions, seed))
+    return bare(cell.measure(random_configurations(KUKA, count, seed), 1, seed))
 
 
 def solved(data=None, robot: Robot = KUKA, **options):
     return identify(IdentificationProblem(robot, data or data_of(), **{"sigma": SIGMA} | options))
 
 
-def validated(change=lambda points: points, required=None, seed: int = 1):
+def plainly(data=None, robot: Robot = KUKA, **options):
+    """By plain least squares."""
+    return solved(data, robot, error_model=PAPER, **options)
+
+
+def validated(change=lambda points: points, required=None, seed: int = 1, **options):
     """Fresh points, changed beforehand."""
-    problem = IdentificationProblem(KUKA, data_of(seed), sigma=SIGMA, required_accuracy=required)
+    problem = IdentificationProblem(KUKA, data_of(seed), SIGMA, required_accuracy=required, **options)
     cell, _ = plain_cell(seed)
     fresh = bare(cell.measure(random_configurations(KUKA, 40, 77), 1, 77))
     return validate(problem, identify(problem), [bare(fresh, change(np.array(fresh.p)))])
@@ -40,76 +49,60 @@ def shaken(points: np.ndarray, size: float) -> np.ndarray:
     return points + size * np.random.default_rng(5).standard_normal(points.shape)
 
 
-def elbow():
-    """Two minima that are equally deep."""
-    robot = Robot.load("planar_2r").with_parameters("offsets")
-    q = np.array([[turn, 0.006] for turn in np.linspace(-0.4, 0.9, 12)])
-    cell = SimulatedCell(robot, dict(zip(robot.parameter_names, (0.001, -0.03), strict=True)), 1e-5)
-    return solved(bare(cell.measure(q, 1, 1)), robot, sigma=1e-5, starts=20)
-
-
 def one_joint(**options):
     q = np.repeat(random_configurations(KUKA, 1, 5), 15, axis=0)
     q[:, 0] = np.linspace(-1, 1, 15)
     cell, _ = plain_cell(1)
-    poses = random_configurations(KUKA, 2, 6)
-    return solved(bare(cell.measure(q, 1, 5)), test_poses=poses, **options)
+    return plainly(bare(cell.measure(q, 1, 5)), test_poses=POSES, **options)
 
 
 def spoilt(share: float, loss: str = "robust"):
     data, _ = spoil(data_of(count=50), 1, share, exchange=False)
-    return solved(data, loss=loss, starts=0, discrepancy="off", joint_corrections="off")
+    return solved(data, loss=loss)
 
 
-def wrong(count: int = 60, **options):
+@cache
+def wrong(**options):
+    """Joints that err as no geometry does."""
     robot = WrongRobot(2)
-    poses = random_configurations(KUKA, 3, 6)
-    return solved(robot.measure(random_configurations(KUKA, count, 2)), robot.asked, test_poses=poses, **options)
-
-
-def stood_elsewhere(move: np.ndarray, **options):
-    data = data_of(count=40)
-    return solved(bare(data, data.p + move[:, None]), **options)
-
-
-def bumped(**options):
-    """By 0.11 mm; what a discrepancy may explain moves the parameters by fewer of their standard deviations."""
-    return stood_elsewhere(np.where(np.arange(40)[:, None] < 22, 0.0, [8e-5, 8e-5, 0.0]), **options)
-
-
-def reseated():
-    cell, asked = placed_cell(1, "offsets")
-    data = bare(cell.measure(random_configurations(asked, 40, 1), 1, 1))
-    seat = cell.truth.robot.target_offsets + np.array([[0, 0, 0], [4e-4, 0, 0], [0, 0, 0]])
-    moved = cell.truth.with_targets(seat).positions(data.q) - cell.truth.positions(data.q)
-    points = data.p + np.where(np.arange(40)[:, None, None] < 20, 0.0, moved)
-    return solved(bare(data, points), asked, starts=0)
-
-
-def distances():
-    """Of a tracker at the base, each wrong by a number of its own."""
-    data, off = data_of(count=40), 2e-4 * np.random.default_rng(1).standard_normal((40, 1, 1))
-    return solved(bare(data, data.p + off * data.p / np.linalg.norm(data.p, axis=2, keepdims=True)))
+    data = robot.measure(random_configurations(KUKA, 60, 2))
+    return solved(data, robot.asked, test_poses=random_configurations(KUKA, 3, 6), **options)
 
 
 def moved_for_good():
     data = data_of(count=40)
     points = np.array(data.p)
     points[33:] += [0.03, 0.0, 0.01]
-    return solved(bare(data, points), loss="robust")
+    return solved(bare(data, points))
 
 
-def no_gain():
-    """d2 is asked for; what ails the robot is q2."""
-    asked = KUKA.with_parameters("d2")
-    cell = SimulatedCell(KUKA.with_parameters("q2"), {"q2": 5e-4}, SIGMA)
-    return solved(bare(cell.measure(random_configurations(KUKA, 20, 1), 1, 1)), asked, discrepancy="off")
+def other_parameters(size: float):
+    """d2 is to be identified; what ails the robot is q2."""
+    robot, cell = KUKA.with_parameters("d2"), SimulatedCell(KUKA.with_parameters("q2"), {"q2": size}, SIGMA)
+    return plainly(bare(cell.measure(random_configurations(KUKA, 20, 1), 1, 1)), robot)
+
+
+def nothing_wrong():
+    """A robot as its data sheet says, measured often: there is nothing to correct."""
+    cell = SimulatedCell(KUKA, {}, SIGMA)
+    return plainly(bare(cell.measure(random_configurations(KUKA, 200, 1), 1, 1)), KUKA.with_parameters("d2,q2"))
+
+
+def of_three_millimetres_as_many():
+    """The zero of joint 2 is off by 1.3 mrad, and one length is all that may differ."""
+    data = data_of()
+    turned = data.q + np.array([0.0, 1.3e-3, 0.0, 0.0, 0.0, 0.0])
+    return plainly(Measurements(KUKA.joint_names, turned, data.p), KUKA.with_parameters("d2"))
+
+
+def tape_measure():
+    """Nothing is wrong with the robot; four points, as noisy as a tape measure, say otherwise."""
+    cell = SimulatedCell(KUKA, {}, 3e-3)
+    return bare(cell.measure(random_configurations(KUKA, 4, 1), 1, 3))
 
 
 def overfitted():
-    """Nothing is wrong with the robot; four points, as noisy as a tape measure, say otherwise."""
-    cell = SimulatedCell(KUKA, {}, 3e-3)
-    problem = IdentificationProblem(KUKA, bare(cell.measure(random_configurations(KUKA, 4, 1), 1, 3)), sigma=3e-3)
+    problem = IdentificationProblem(KUKA, tape_measure(), sigma=3e-3, error_model=PAPER)
     fresh = SimulatedCell(KUKA, {}, 1e-5).measure(random_configurations(KUKA, 30, 9), 1, 9)
     return validate(problem, identify(problem), [bare(fresh)])
 
@@ -119,43 +112,24 @@ def copied():
     return solved(data.select([*range(25), 3, 4]))
 
 
-def joint_bend():
-    """A structure in the residuals of a fit that may not be given a discrepancy."""
-    return wrong(discrepancy="off", joint_corrections="off", starts=0)
-
-
 def close_together():
     """Configurations within two degrees: combinations hardly seen, values correlated."""
     q = random_configurations(KUKA, 1, 5) + np.random.default_rng(1).uniform(-0.04, 0.04, (40, 6))
     cell, _ = plain_cell(1)
-    return solved(bare(cell.measure(q, 1, 5)), sigma=None)
+    return plainly(bare(cell.measure(q, 1, 5)), sigma=None)
 
 
-def round_one_posture(**options):
-    """Joints that err are not seen there."""
-    cell = SimulatedCell(KUKA, random_deviations(KUKA, 1), 7e-6)
-    return solved(bare(cell.measure(ROUND, 2, 1)), sigma=7e-6, **options)
-
-
-def modelled(model=None, **options):
-    """With an error model; the paper's has nothing but noise."""
-    return solved(error_model=model or ErrorModel.paper(), **options)
-
-
-def untrue():
-    """As ``overfitted``, judged by the visits themselves."""
-    cell = SimulatedCell(KUKA, {}, 3e-3)
-    return modelled(data=bare(cell.measure(random_configurations(KUKA, 4, 1), 1, 3)), sigma=3e-3)
+def interrupted():
+    return judged(replace(solved(), fit=replace(solved().fit, status="not_converged")))
 
 
 PROVOKED = {
     # code: (level, how)…
-    "not_converged": [("FAIL", lambda: solved(iterations=1))],
-    "other_minimum": [("WARN", elbow)],
-    "large_residuals": [("FAIL", lambda: solved(bare(data_of(), shaken(data_of().p, 0.05))))],
-    "no_gain": [("WARN", no_gain)],
-    "too_few_measurements": [("WARN", lambda: solved(data_of(count=4)))],
-    "no_uncertainty": [("FAIL", lambda: solved(data_of(count=3), sigma=None))],
+    "not_converged": [("FAIL", interrupted)],
+    "large_residuals": [("FAIL", lambda: plainly(bare(data_of(), shaken(data_of().p, 0.05))))],
+    "explained_little": [("WARN", of_three_millimetres_as_many)],
+    "no_gain": [("WARN", lambda: other_parameters(2e-4)), ("PASS", nothing_wrong)],
+    "too_few_measurements": [("WARN", lambda: plainly(data_of(count=4)))],
     "copies": [("WARN", copied)],
     "rejected": [
         ("PASS", lambda: spoilt(0.02)),
@@ -163,51 +137,42 @@ PROVOKED = {
         ("FAIL", lambda: spoilt(0.30)),
     ],
     "suspects": [("WARN", lambda: spoilt(0.02, "linear"))],
-    "repeatability": [("WARN", lambda: solved(data_of(repetitions=3), sigma=SIGMA / 3))],
-    "model_discrepancy": [("PASS", wrong)],
-    "poor_fit": [("WARN", lambda: solved(sigma=SIGMA / 2, discrepancy="off"))],
-    "noise_overstated": [("WARN", lambda: solved(sigma=SIGMA * 3))],
-    "drift": [("WARN", lambda: stood_elsewhere(np.linspace([0, 0, 0], [1e-4, 1e-4, 0], 40)))],
-    "bump": [("WARN", bumped), ("FAIL", lambda: bumped(discrepancy="off"))],
-    "reseat": [("FAIL", reseated)],
-    "distance": [("WARN", distances)],
+    "poor_fit": [("WARN", lambda: plainly(sigma=SIGMA / 2))],
+    "noise_overstated": [("WARN", lambda: plainly(sigma=SIGMA * 3))],
     "moved": [("WARN", moved_for_good)],
-    "joint_corrections": [("PASS", wrong)],
-    "residual_structure": [("WARN", joint_bend), ("PASS", wrong)],
-    "local": [("WARN", round_one_posture), ("PASS", lambda: round_one_posture(test_poses=POSE))],
     "unidentifiable": [("PASS", one_joint)],
     "nearly_dependent": [("PASS", close_together)],
     "correlated": [("PASS", close_together)],
     "blind_test_pose": [("FAIL", one_joint)],
     "required_accuracy": [
-        ("PASS", lambda: solved(test_poses=random_configurations(KUKA, 2, 6), required_accuracy=1e-3)),
-        ("FAIL", lambda: solved(test_poses=random_configurations(KUKA, 2, 6), required_accuracy=1e-6)),
-        ("FAIL", lambda: wrong(required_accuracy=1e-4)),
-        ("WARN", lambda: solved(required_accuracy=1e-3)),
+        ("PASS", lambda: solved(test_poses=POSES, required_accuracy=1e-3)),
+        ("FAIL", lambda: solved(test_poses=POSES, required_accuracy=1e-6)),
+        ("FAIL", lambda: wrong(required_accuracy=5e-5)),
+        ("PASS", lambda: solved(required_accuracy=1e-3)),
+        ("FAIL", lambda: plainly(sigma=None, required_accuracy=1e-6)),
         ("PASS", lambda: validated(required=1e-3)),
         ("FAIL", lambda: validated(lambda p: shaken(p, 10 * SIGMA), required=1e-4)),
-        ("PASS", lambda: modelled(required_accuracy=1e-3)),
-        ("FAIL", lambda: modelled(sigma=None, required_accuracy=1e-6)),
+        ("PASS", lambda: plainly(required_accuracy=1e-3)),
     ],
-    "unproven": [("WARN", lambda: modelled(data=data_of(count=3)))],
+    "unproven": [("WARN", lambda: plainly(data_of(count=3)))],
     "left_out": [
-        ("PASS", modelled),
-        ("WARN", lambda: modelled(sigma=SIGMA / 2)),
-        ("FAIL", lambda: modelled(sigma=SIGMA / 5)),
+        ("PASS", plainly),
+        ("PASS", solved),
+        ("WARN", lambda: plainly(sigma=SIGMA / 2.5)),
+        ("FAIL", lambda: plainly(sigma=SIGMA / 5)),
     ],
-    "no_gain_left_out": [("FAIL", untrue)],
-    "error_model": [("PASS", lambda: wrong(error_model=typical()))],
-    "not_validated": [("PASS", solved)],
+    "no_gain_left_out": [("FAIL", lambda: plainly(tape_measure(), sigma=3e-3))],
+    "error_model": [("PASS", wrong), ("WARN", lambda: wrong(required_accuracy=4.5e-4))],
     "no_gain_held_out": [("FAIL", overfitted)],
     "predicted_and_achieved": [
         ("PASS", validated),
-        ("WARN", lambda: validated(lambda p: shaken(p, 2 * SIGMA))),
+        ("WARN", lambda: validated(lambda p: shaken(p, 2.5 * SIGMA))),
         ("FAIL", lambda: validated(lambda p: shaken(p, 10 * SIGMA))),
     ],
-    "region": [("WARN", lambda: validated(lambda p: shaken(p, 2 * SIGMA)))],
+    "region": [("WARN", lambda: validated(lambda p: shaken(p, 2.5 * SIGMA)))],
 }
 CASES = [(code, level, how) for code, ways in PROVOKED.items() for level, how in ways]
-USUAL = {"not_validated", "predicted_and_achieved", "correlated", "nearly_dependent", "left_out"}
+USUAL = {"predicted_and_achieved", "correlated", "nearly_dependent", "left_out", "error_model"}
 """Reasons that a clean calibration may have, all of them at PASS."""
 
 
@@ -221,35 +186,42 @@ def test_the_table_is_complete():
         assert {level for level, _ in ways} <= levels[code], code
 
 
-def problem() -> IdentificationProblem:
-    return IdentificationProblem(KUKA, data_of(), sigma=SIGMA)
-
-
 @cache
 def clean(how: str):
-    cell, asked = placed_cell(3)
-    placed = bare(cell.measure(random_configurations(asked, 40, 3), 1, 3))
-    poses = random_configurations(KUKA, 2, 6)
+    cell, robot = placed_cell(3)
+    placed = bare(cell.measure(random_configurations(robot, 40, 3), 1, 3))
     return {
-        "plain": lambda: solved(test_poses=poses),
-        "error model": lambda: modelled(typical(), test_poses=poses),
-        "sigma unknown": lambda: solved(sigma=None, test_poses=poses),
-        "repeated": lambda: solved(data_of(repetitions=2), test_poses=poses),
-        "robust": lambda: solved(loss="robust", test_poses=poses),
+        "paper": lambda: plainly(test_poses=POSES),
+        "all terms": lambda: solved(test_poses=POSES),
+        "sigma unknown": lambda: solved(sigma=None, test_poses=POSES),
+        "linear": lambda: solved(loss="linear", test_poses=POSES),
         "validated": validated,
-        "cross-validated": lambda: cross_validate(p := problem(), identify(p)),
-        "placed": lambda: solved(placed, asked, test_poses=poses),
+        "placed": lambda: solved(placed, robot, test_poses=POSES),
     }[how]()  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "how",
-    ["plain", "error model", "sigma unknown", "repeated", "robust", "validated", "cross-validated", "placed"],
-)
+@pytest.mark.parametrize("how", ["paper", "all terms", "sigma unknown", "linear", "validated", "placed"])
 def test_a_clean_calibration_passes_and_says_little(how):
-    found = clean(how).verdict
-    assert found.level == "PASS"
-    assert {r.code for r in found.reasons} <= USUAL | ({"unidentifiable"} if how == "placed" else set())
+    verdict = clean(how).verdict
+    assert verdict.level == "PASS"
+    assert {r.code for r in verdict.reasons} <= USUAL
+
+
+def test_robots_as_they_are_expected_to_be_pass():
+    """Robots drawn from the error model, scales too; one in a hundred may be called WARN or FAIL."""
+    seeds, others = repeats(12, 100), 0
+    robot = Robot.load("ur10e").with_targets([[0.05, 0.0, 0.1], [0.0, -0.06, 0.05]]).with_parameters("full")
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        truth = Truth.draw(robot, typical(Isotropic(2e-5)).with_drawn_scales(rng), rng)
+        q = random_configurations(robot, 60, seed)
+        data = Measurements(robot.joint_names, q, truth.measure(q, rng))
+        problem = IdentificationProblem(
+            robot.with_parameters("full", ("base", "tool")), data.select(np.arange(40)), sigma=2e-5
+        )
+        estimate = validate(problem, identify(problem), [data.select(np.arange(40, 60))])
+        others += estimate.verdict.level != "PASS"
+    assert others <= binom.isf(1e-3, seeds, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -257,53 +229,84 @@ def test_a_clean_calibration_passes_and_says_little(how):
 )
 def test_reason(code, level, how):
     estimate = how()
-    found = estimate.verdict
-    those = [r for r in found.reasons if r.code == code]
-    assert those, [r.code for r in found.reasons]
+    verdict = estimate.verdict
+    those = [r for r in verdict.reasons if r.code == code]
+    assert those, [r.code for r in verdict.reasons]
     assert max((r.level for r in those), key=LEVELS.index) == level
-    ranks = [LEVELS.index(r.level) for r in found.reasons]
+    ranks = [LEVELS.index(r.level) for r in verdict.reasons]
     assert ranks == sorted(ranks, reverse=True)
-    assert found.level == found.reasons[0].level
-    for reason in found.reasons:
+    assert verdict.level == verdict.reasons[0].level
+    for reason in verdict.reasons:
         assert reason.text and "nan" not in reason.text.lower()
         assert reason.level == "PASS" or reason.advice
-    assert estimate.to_dict()["verdict"]["level"] == found.level
+    assert estimate.to_dict()["verdict"]["level"] == verdict.level
+
+
+def test_the_most_important_reason_comes_first():
+    """Of one level, in the order of the table."""
+    order = list(dict.fromkeys(rule.code for rule in RULES.values()))
+    estimate = wrong(required_accuracy=5e-5)
+    for level in LEVELS:
+        ranks = [order.index(r.code) for r in estimate.verdict.reasons if r.level == level]
+        assert ranks == sorted(ranks)
+    assert estimate.verdict.reasons[0].code == "required_accuracy"
 
 
 def required_reason(estimate):
-    (reason,) = (r for r in estimate.verdict.reasons if r.code == "required_accuracy")
-    return reason
+    return next(r for r in estimate.verdict.reasons if r.code == "required_accuracy" and "held-out" in r.text)
 
 
 def test_what_is_required_is_the_robots_not_the_trackers():
     """A robot calibrated to 0.02 mm, measured with noise of 0.05 mm, reaches 0.035 mm; 0.3 mm are seen."""
-    good = validated(required=3.5e-5).validation
-    assert good.rms > 3.5e-5 and good.noise_rms == pytest.approx(np.sqrt(3) * SIGMA)
-    assert required_reason(validated(required=3.5e-5)).level == "PASS"
-    off = validated(lambda p: p + np.array([3e-4, 0.0, 0.0]), required=2e-4)
+    good = validated(required=3.5e-5, error_model=PAPER)
+    assert good.validation.rms > 3.5e-5 and good.validation.noise_rms == pytest.approx(np.sqrt(3) * SIGMA)
+    assert required_reason(good).level == "PASS"
+    off = validated(lambda p: p + np.array([3e-4, 0.0, 0.0]), required=2e-4, error_model=PAPER)
     assert required_reason(off).level == "FAIL"
     # Noise twice as large as it is said to be is the robot's until somebody says otherwise.
-    assert required_reason(validated(lambda p: shaken(p, 2 * SIGMA), required=3.5e-5)).level == "FAIL"
+    noisy = validated(lambda p: shaken(p, 2 * SIGMA), required=3.5e-5, error_model=PAPER)
+    assert required_reason(noisy).level == "FAIL"
+
+
+def test_what_chance_may_have_made_is_no_failure():
+    """0.1 mm achieved by few points where 0.09 mm are required: WARN; by many: FAIL."""
+    base = validated(required=9e-5, error_model=PAPER)
+    for freedom, level in ((9.0, "WARN"), (3000.0, "FAIL")):
+        told = replace(base.validation, rms=1e-4, noise_rms=0.0, freedom=freedom)
+        assert required_reason(judged(replace(base, validation=told))).level == level
+    told = replace(base.validation, rms=8.9e-5, noise_rms=0.0, freedom=9.0)
+    assert required_reason(judged(replace(base, validation=told))).level == "PASS"
+
+
+def test_at_the_test_poses_what_visits_left_out_achieve_counts():
+    """Predicted 0.1 mm, required 0.15 mm; visits left out err by three times what was predicted of them."""
+    base = plainly(test_poses=POSES, required_accuracy=1.5e-4)
+    accuracy = replace(base.accuracy, predicted=np.full(2, 1e-4))
+    left = replace(base.left_out, predicted_rms=1e-4, freedom=1000.0)
+    for rms, level in ((1e-4, "PASS"), (1.4e-4, "PASS"), (3e-4, "FAIL")):
+        made = judged(replace(base, accuracy=accuracy, left_out=replace(left, rms=rms)))
+        (reason,) = (r for r in made.verdict.reasons if r.code == "required_accuracy")
+        assert reason.level == level
 
 
 def test_noise_that_nobody_knows_is_not_taken_off():
     """Its level came from the residuals, where the robot's own scatter may be part of it."""
-    problem = IdentificationProblem(KUKA, data_of(), required_accuracy=3.5e-5)
+    problem = IdentificationProblem(KUKA, data_of(), error_model=PAPER, required_accuracy=3.5e-5)
     cell, _ = plain_cell(1)
     fresh = bare(cell.measure(random_configurations(KUKA, 40, 77), 1, 77))
-    found = validate(problem, identify(problem), [fresh])
-    assert found.noise.source == "residuals" and np.isnan(found.validation.noise_rms)
-    assert found.validation.robot_rms == found.validation.rms > 3.5e-5
-    assert required_reason(found).level == "FAIL" and "included" in required_reason(found).text
+    estimate = validate(problem, identify(problem), [fresh])
+    assert estimate.noise.source == "residuals" and np.isnan(estimate.validation.noise_rms)
+    assert estimate.validation.robot_rms == estimate.validation.rms > 3.5e-5
+    assert required_reason(estimate).level == "FAIL" and "included" in required_reason(estimate).text
 
 
-def test_of_no_noise_as_much_as_of_much_is_exceeded_by_chance_once_in_forty():
-    """A perfect robot, 2000 validations of 30 points: more than the noise's part is left in 2.3 %."""
+def test_of_no_noise_as_much_as_of_much_is_exceeded_by_chance_once_in_a_hundred():
+    """A perfect robot, 2000 validations of 30 points: more than the noise's part is left in 1 %."""
     rng = np.random.default_rng(3)
     square = np.mean(np.sum(rng.standard_normal((2000, 30, 3)) ** 2, axis=2), axis=1)
     one = validated().validation
-    made = [replace(one, rms=float(np.sqrt(s)), count=30, noise_rms=np.sqrt(3.0)) for s in square]
-    assert np.mean([v.robot_rms > 0 for v in made]) == pytest.approx(0.023, abs=0.015)
+    made = [replace(one, rms=float(np.sqrt(s)), noise_rms=np.sqrt(3.0), freedom=90.0) for s in square]
+    assert np.mean([v.robot_least > 0 for v in made]) == pytest.approx(0.01, abs=0.008)
 
 
 def test_levels_of_shares_and_ratios_are_where_they_are_said_to_be():
@@ -321,6 +324,6 @@ def test_levels_of_shares_and_ratios_are_where_they_are_said_to_be():
         )
         assert next(r for r in made.verdict.reasons if r.code == "rejected").level == level
     for ratio, level in ((1.49, "PASS"), (1.51, "WARN"), (2.99, "WARN"), (3.01, "FAIL")):
-        own = replace(base.validation, rms=ratio * 1e-4, predicted_rms=1e-4)
+        own = replace(base.validation, rms=ratio * 1e-4, predicted_rms=1e-4, freedom=np.inf)
         made = judged(replace(base, validation=own))
         assert next(r for r in made.verdict.reasons if r.code == "predicted_and_achieved").level == level
