@@ -56,6 +56,8 @@ def add(commands: Commands, summary: str) -> None:
     option(truth, "--angle-error", "S", "standard deviation of drawn angle errors [rad]", ANGLE_ERROR)
     option(truth, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", SIGMA)
     add_seed(truth)
+    text = "seed of what is new at each measurement, for another set of the same robot (drawn from --seed)"
+    option(truth, "--noise-seed", "N", text, kind=int)
     option(parser, "--output", "FILE", "CSV of measurements (stdout without --json)")
 
 
@@ -73,6 +75,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     configurations, repetitions = _plan(robot, args)
     check_count("--seed", args.seed, low=0, high=2**63 - 1)
     truth_seed, noise_seed = independent_seeds(args.seed, 2)
+    if args.noise_seed is not None:
+        noise_seed = check_count("--noise-seed", args.noise_seed, low=0, high=2**63 - 1)
     errors = _true_errors(robot, args, truth_seed)
     model = read_error_model(args.error_model)
     cell = SimulatedCell(robot, errors, args.sigma, error_model=model, seed=truth_seed)

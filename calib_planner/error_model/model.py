@@ -266,9 +266,12 @@ class ErrorModel:
         return matrix
 
     def draw_coefficients(self, robot: Robot, rng: np.random.Generator) -> FloatArray:
-        """(coefficients,) β drawn from its prior at the scales in force; 0 where the prior is flat [unit]."""
+        """(coefficients,) β drawn from its prior at the scales in force; 0 where the prior is flat [unit].
+
+        Gravity and joint functions come first: they stay the same whatever parameters are active.
+        """
         variances, stated = self.variances(robot), self.placement.stated
-        drawn = rng.standard_normal(len(variances))
+        drawn = np.roll(rng.standard_normal(len(variances)), self.placement.size(robot))
         beta = np.sqrt(np.where(np.isinf(variances), 0.0, variances)) * drawn
         if stated is not None:
             places = stated.places(robot.parameter_names)

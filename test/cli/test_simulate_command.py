@@ -79,6 +79,21 @@ def test_the_same_seed_the_same_points(simulate: Any) -> None:
     assert one == same and one["points"] != other["points"]
 
 
+def test_another_set_of_the_same_robot(simulate: Any) -> None:
+    """As for a validation: nothing changes but what is new at each measurement."""
+    one, two = (simulate("--seed", 4, "--noise-seed", seed) for seed in (1, 2))
+    keys = ("true", "error_model")
+    assert [one[k] for k in keys] == [two[k] for k in keys] == [simulate("--seed", 4)[k] for k in keys]
+    apart = rms(np.array(one["points"]) - np.array(two["points"]))
+    terms = {t["name"]: t["size"] for t in one["error_model"]["terms"]}
+    assert apart == pytest.approx(np.sqrt(2.0) * np.hypot(terms["visits"], terms["points"]), rel=0.2)
+    # A robot does not depend on what else is unknown of its cell.
+    more = simulate("--seed", 4, "--noise-seed", 1, "--unknown", "base,tool")
+    assert {t["name"]: t["size"] for t in more["error_model"]["terms"]}["gravity"] == pytest.approx(
+        terms["gravity"], rel=1e-2
+    )
+
+
 def test_the_tables(tmp_path: Path, simulate: Any, capsys: pytest.CaptureFixture[str]) -> None:
     words = [
         "simulate",
