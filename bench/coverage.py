@@ -166,7 +166,7 @@ def one_scales(case: Case, seed: int) -> dict[str, Any]:
     cell = cell_of(case, seed)
     data, _ = spoil(cell.measure(cell.configurations(case.count), case.repetitions), case, cell.rng)
     found = identify(cell.problem(data))
-    terms = {t.name: t.kept for t in found.terms}
+    terms = {t.name: t.used for t in found.terms}
     return {"values": found.knowledge.model.values, "kept": terms, "seconds": found.seconds}
 
 

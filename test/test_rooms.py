@@ -309,8 +309,6 @@ ALLOWED_NAMES = {
     "Pool",
 }
 ALLOWED_TEXT = re.compile(r"ThreadPool|ProcessPool|threadpool|held.out|hand on the stop", re.IGNORECASE)
-EXEMPT = ("identification",)
-"""Its inside is rewritten next; its names come then."""
 
 
 def names_defined(tree: ast.AST) -> Iterator[str]:
@@ -363,7 +361,7 @@ def texts_by_place() -> Iterator[tuple[str, str]]:
     yield "docs", re.sub(r"`[^`\n]*`", "", (ROOT / "README.md").read_text(encoding="utf-8"))
 
 
-WITH_WORDS = [p for p in (*PLACES, "docs", "msg_defs", "config") if p not in EXEMPT]
+WITH_WORDS = [*PLACES, "docs", "msg_defs", "config"]
 
 
 @pytest.mark.parametrize("place", WITH_WORDS)

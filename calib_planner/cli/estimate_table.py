@@ -128,10 +128,10 @@ def _terms(estimate: Estimate) -> Table:
     for heading in ("term", "size", "± std", "gain", "what it means"):
         table.add_column(heading, justify="left" if heading in ("term", "what it means") else "right")
     for term in estimate.terms:
-        size = milli(term.size) if term.kept else "left out"
+        size = milli(term.size) if term.used else "left out"
         std = milli(term.std) if np.isfinite(term.std) else ""
         gain = f"{term.gain:+.1f}" if np.isfinite(term.gain) else ""
-        table.add_row(term.name, size, std, gain, MEANINGS[term.name], style="" if term.kept else "dim")
+        table.add_row(term.name, size, std, gain, MEANINGS[term.name], style="" if term.used else "dim")
     table.caption = "gain: log score of visits predicted from the others, with the term less without it"
     return table
 

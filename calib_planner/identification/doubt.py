@@ -33,7 +33,7 @@ FREEDOM = 2.0
 IMPOSSIBLE = 0.01
 """Probability that one among all points, or all runs, of a sound calibration is called impossible."""
 FEW = 0.02
-"""Share of impossible points up to which they are found one by one."""
+"""Share of impossible points up to which they are taken out one by one."""
 SWOLLEN = 0.6
 """Median of d² over that of χ² below which gross errors have swollen the scales."""
 OUT = 10.0

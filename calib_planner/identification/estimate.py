@@ -360,7 +360,7 @@ class Reason:
     Attributes:
         level: ``PASS``, ``WARN`` or ``FAIL``.
         code: A stable word for programs.
-        text: What was found.
+        text: What is the case.
         advice: What to do; may be empty.
     """
 
@@ -419,7 +419,7 @@ class Estimate:
         accuracy: Errors predicted at the test poses.
         left_out: Error of visits that all others predict, beside its prediction.
         placement_alone: The same of ``calibrated``.
-        terms: Every term of the error model asked for, with size and gain.
+        terms: Every term of the error problem's model, with size and gain.
         seconds: Time spent.
         validation: Statistics on held-out data, if any was given.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.

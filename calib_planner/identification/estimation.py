@@ -8,7 +8,7 @@
                   (``doubt``).
     4. terms      A term that does not better the left-out score goes (``left_out``).
     5. all        Many points: 1 to 4 are done with some of the visits; generalised least squares at the scales
-                  found is done with all of them.
+                  chosen is done with all of them.
 
 The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
 
@@ -101,10 +101,10 @@ class ModelEstimate:
     """What the measurements say.
 
     Attributes:
-        knowledge: Robot, model with the scales found, coefficients and their covariance; it predicts.
+        knowledge: Robot, model with the scales estimated, coefficients and their covariance; it predicts.
         left_out: (M4) of every visit.
         doubt: (N, targets) variance of each point beside the model's [m²]; 0 where it counts in full.
-        terms: Every term of the model asked for, with its size and gain.
+        terms: Every term of the problem's model, with its size and gain.
         solution: The last linear problem and its solution.
         rounds: Relinearisations made.
         converged: Whether the predictions stood still at the end.
@@ -126,7 +126,7 @@ class Origin:
     """What an estimate was made from, for an update of it.
 
     Attributes:
-        asked: The model before scales were estimated and terms went.
+        model: The model before scales were estimated and terms went.
         data: The measurements, joints in the robot's order.
         robust: Whether impossible points lose weight.
         shifted: (N, targets) D of the points of a run of visits that is shifted [m²].
@@ -136,7 +136,7 @@ class Origin:
         surprise: Sum of the squared left-out residuals over its expectation at the last full fit.
     """
 
-    asked: ErrorModel
+    model: ErrorModel
     data: Measurements
     robust: bool
     shifted: FloatArray
@@ -331,15 +331,15 @@ class _Work:
         while True:
             score = left_out(solution, self.groups).score
             trials = {t: maximise(_without(solution.problem, t), 6) for t in _optional(solution.problem.model)}
-            found = {t: score - left_out(trial, self.groups).score for t, trial in trials.items()}
-            gains |= found
-            if not found or min(found.values()) > 0.0:
+            trial_gains = {t: score - left_out(trial, self.groups).score for t, trial in trials.items()}
+            gains |= trial_gains
+            if not trial_gains or min(trial_gains.values()) > 0.0:
                 return solution, gains
-            worst = min(found, key=lambda t: found[t])
+            worst = min(trial_gains, key=lambda t: trial_gains[t])
             before = self.state
             solution = trials[worst]
-            kept = _place(before.model, solution.problem.model, self.robot)
-            self.state = replace(before, coefficients=before.coefficients[kept], model=solution.problem.model)
+            left = _place(before.model, solution.problem.model, self.robot)
+            self.state = replace(before, coefficients=before.coefficients[left], model=solution.problem.model)
 
 
 def fit_error_model(
@@ -382,7 +382,7 @@ def fit_error_model(
 
 def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool) -> ModelEstimate:
     """The same for clean arguments."""
-    asked = model
+    before = model
     robot, far, squares = _placed(robot, data)
     model = _with_payload(model, data)
     some = _some(data)
@@ -423,7 +423,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
         rounds=work.rounds,
         converged=work.converged,
         origin=Origin(
-            asked,
+            before,
             data,
             robust,
             work.shifted,
@@ -478,21 +478,21 @@ class PlacementAlone:
     converged: bool
 
 
-def placement_alone(found: ModelEstimate) -> PlacementAlone:
+def placement_alone(fit: ModelEstimate) -> PlacementAlone:
     """The parameters that predict best where gravity and joint functions are nobody's business.
 
     They are not those of the whole model: they take over what they can of the terms that are off. What they
-    cannot has to be in visits and points, whose scales are found anew. Points that were doubted stay so.
+    cannot has to be in visits and points, whose scales are estimated anew. Points that were doubted stay so.
     """
-    problem, origin = found.solution.problem, found.origin
+    problem, origin = fit.solution.problem, fit.origin
     model, robot = problem.model, problem.robot
     if model.gravity is None and model.joint_functions is None:
-        known = replace(found.knowledge, robot=robot, coefficients=origin.coefficients)
-        return PlacementAlone(known, found.left_out, found.converged)
+        known = replace(fit.knowledge, robot=robot, coefficients=origin.coefficients)
+        return PlacementAlone(known, fit.left_out, fit.converged)
     alone = replace(model, gravity=None, joint_functions=None)
     work = _Work(robot, origin.data, alone)
     count = len(robot.parameter_names)
-    work.state = _State(origin.coefficients[:count], alone, found.doubt)
+    work.state = _State(origin.coefficients[:count], alone, fit.doubt)
     solution = work.settle(MOST_ROUNDS)
     covariance = _covariance(solution, scale_covariance(solution))
     known = _knowledge(work, covariance, _hidden(solution.problem))
@@ -518,7 +518,7 @@ def _updated(
     """
     origin, old = start.origin, start.solution.problem
     placed = old.robot
-    if not _same_robot(robot, placed) or repr(model) != repr(origin.asked) or robust != origin.robust:
+    if not _same_robot(robot, placed) or repr(model) != repr(origin.model) or robust != origin.robust:
         return None
     if model.is_papers or not start.converged or old.basis.shape[0] > old.basis.shape[1]:
         return None

@@ -1,6 +1,6 @@
 """What the model says of measurements that it has not seen: left-out residuals in closed form, (M4).
 
-A *group* is all visits at one configuration: repetitions would tell each other what the model is asked for. With
+A *group* is all visits at one configuration: repetitions would tell each other what the model has to say. With
 P of the linear problem (``likelihood``) and P_gg its block for group g, the residual of the group under an
 estimate from all other visits, at the same scales, and its covariance are
 

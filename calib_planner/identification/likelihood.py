@@ -590,7 +590,7 @@ def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], Flo
     other measurements, plus ∂Λ Bᵀ P y.
 
     Args:
-        solution: At the scales found.
+        solution: At the estimated scales.
         scales: Their names, and cov(log θ) as ``scale_covariance`` has it.
     """
     problem, (names, covariance) = solution.problem, scales

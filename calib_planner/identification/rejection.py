@@ -59,7 +59,7 @@ def explain(
     Returns:
         (row, target) → words, for the points that fit elsewhere. Rows and targets from 0.
     """
-    found: dict[tuple[int, int], str] = {}
+    words: dict[tuple[int, int], str] = {}
     for i in np.flatnonzero(rejected.any(axis=1)):
         targets = np.flatnonzero(rejected[i])
         if len(targets) > 1:
@@ -67,7 +67,7 @@ def explain(
             nearest = apart.argmin(axis=1)
             if (apart.min(axis=1) < reach).all() and (nearest != np.arange(len(targets))).all():
                 for t, k in zip(targets, nearest, strict=True):
-                    found[int(i), int(t)] = f"fits target {targets[k] + 1}: targets exchanged?"
+                    words[int(i), int(t)] = f"fits target {targets[k] + 1}: targets exchanged?"
                 continue
         apart = np.linalg.norm(predicted[:, targets] - data.p[i, targets], axis=2)
         # One of the points may be wrong besides.
@@ -76,5 +76,5 @@ def explain(
         k = int(apart.argmin())
         if apart[k] < reach:
             for t in targets:
-                found[int(i), int(t)] = f"fits the configuration of row {k}: rows exchanged?"
-    return found
+                words[int(i), int(t)] = f"fits the configuration of row {k}: rows exchanged?"
+    return words

@@ -341,20 +341,16 @@ def _left_out_error(left: LeftOut, fit: ModelEstimate, source: str) -> LeftOutEr
 
 
 def _freedom_left_out(left: LeftOut, fit: ModelEstimate) -> float:
-    """Degrees of freedom of the mean square left-out distance, as a χ².
+    """Degrees of freedom of the mean square left-out distance, as a χ²: no more than there are equations that
+    the flat parameters leave.
 
-    Σ‖e_i‖² has the expectation Σ tr S_i and, if the visits were independent, the variance 2 Σ tr S_i², S_i being
-    the covariance of e_i. They are not: m coordinates with p flat parameters have m − p independent residuals,
-    and so many times fewer degrees of freedom there are.
+    A χ² with f degrees of freedom has a root mean square of standard deviation 1/√(2f) of its expectation.
     """
-    use = np.repeat(left.usable, 3, axis=1)
-    blocks = left.covariance * (use[:, :, None] & use[:, None, :])
-    if not use.any():
+    if not left.usable.any():
         return 0.0
-    independent = np.trace(blocks, axis1=1, axis2=2).sum() ** 2 / np.sum(blocks**2)
     linear = fit.solution.problem
-    coordinates = float(linear.seen.sum())
-    return float(independent * max(coordinates - linear.basis.shape[1], 0.0) / coordinates)
+    spare = float(linear.seen.sum()) - linear.basis.shape[1]
+    return float(min(0.5 / left.excess[1] ** 2, max(spare, 0.0)))
 
 
 def _variances(part: FloatArray, use: BoolArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What each term of the error model is worth: its size at the tool, and what it gains.
+"""What each term of the error model brings: its size at the tool, and what it gains.
 
 A term with columns moves the measured points by B û; of the joint functions a component has the share of û that
 its prior variance has of the whole. Visits and points scatter the measured points by the trace of their part of
@@ -21,13 +21,13 @@ from calib_planner.identification.likelihood import LinearProblem
 
 @dataclass(frozen=True, eq=False)
 class TermGain:
-    """What a term is worth.
+    """What a term brings.
 
     Attributes:
         name: ``placement``, ``gravity``, ``smooth``, ``short``, ``visits`` or ``points``.
         size: Root mean square of what it moves a measured point by [m]; 0 if the term went.
-        gain: Left-out log score with it less that without; NaN where it is not asked.
-        kept: Whether it is in the model.
+        gain: Left-out log score with it less that without; NaN where it was not tried.
+        used: Whether it is in the model.
         std: Root mean square of the standard deviation of what it moves a measured point by [m]; NaN for visits
             and points, and if the term went.
     """
@@ -35,21 +35,21 @@ class TermGain:
     name: str
     size: float
     gain: float
-    kept: bool
+    used: bool
     std: float = float("nan")
 
 
 def term_gains(
-    asked: ErrorModel,
+    model: ErrorModel,
     problem: LinearProblem,
     coefficients: FloatArray,
     covariance: FloatArray,
     gains: Mapping[str, float],
 ) -> tuple[TermGain, ...]:
-    """Every term of the model ``asked`` for.
+    """Every term of the ``model``.
 
     Args:
-        asked: The model before terms went.
+        model: The model before terms went.
         problem: The last linear problem, with the model that is left.
         coefficients: (coefficients,) β where it ended.
         covariance: (coefficients, coefficients) of β.
@@ -58,7 +58,7 @@ def term_gains(
     squares, variances = _squares(problem, coefficients), _variances(problem, covariance)
     points = max(float(problem.seen.sum()) / 3.0, 1.0)
     names = [
-        n for term in asked.terms for n in (term.components if isinstance(term, JointFunctions) else (term.name,))
+        n for term in model.terms for n in (term.components if isinstance(term, JointFunctions) else (term.name,))
     ]
     nothing = float("nan")
     return tuple(
@@ -66,7 +66,7 @@ def term_gains(
             name=n,
             size=float(np.sqrt(squares.get(n, 0.0) / points)),
             gain=gains.get(n, nothing),
-            kept=n in squares,
+            used=n in squares,
             std=float(np.sqrt(max(variances[n], 0.0) / points)) if n in variances else nothing,
         )
         for n in names

@@ -57,7 +57,7 @@ class Rule:
 
     Attributes:
         code: A stable word for programs.
-        text: What was found; names in braces stand for what the estimate says.
+        text: What is the case; names in braces stand for what the estimate says.
         advice: Level → what to do, for each level that the reason can have.
     """
 
@@ -283,7 +283,7 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
 
 def _left_out(e: Estimate) -> Iterator[Reason]:
     left, before, required = e.left_out, e.residuals.before.mean, e.accuracy.required
-    terms = [f"{t.name} {length(t.size)}" for t in e.terms if t.kept and t.name in SYSTEMATIC]
+    terms = [f"{t.name} {length(t.size)}" for t in e.terms if t.used and t.name in SYSTEMATIC]
     if terms:
         alone, complete = length(e.placement_alone.rms), length(left.rms)
         level = "WARN" if _needs_all_terms(e) else "PASS"

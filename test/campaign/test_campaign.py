@@ -119,7 +119,7 @@ def test_errors_of_the_joints_are_learnt_and_never_denied(seed):
     """0.4 mrad in every joint: they are learnt, or, by a model without them, the accuracy is not reached."""
     world = world_of(kuka().robot, seed, transmission=4e-4)
     learnt = campaign(kuka(150e-6, seed, budget=120, identification=TYPICAL), world)
-    assert {"smooth", "short"} & {t.name for t in learnt.estimate.terms if t.kept}
+    assert {"smooth", "short"} & {t.name for t in learnt.estimate.terms if t.used}
     assert learnt.outcome == "reached" and learnt.verdict.level != "FAIL"
     assert achieved(learnt, world, POSE) < 150e-6
     stopped = campaign(kuka(60e-6, seed, budget=60), world)

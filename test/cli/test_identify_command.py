@@ -253,7 +253,7 @@ def test_what_the_joints_do_is_learnt_and_can_be_switched_off(run: Run, tmp_path
     write_measurements(path, Measurements(robot.joint_names, read, robot.positions(q) + noise))
     words = ("--robot", "kuka_kr270", "--data", path)
     on, (shown, _), off = run(*words), run(*words, shown=True), run(*words, *PLAIN)
-    kept = {t["name"] for t in on["error_model"]["terms"] if t["kept"]}
+    kept = {t["name"] for t in on["error_model"]["terms"] if t["used"]}
     assert "smooth" in kept and [t["name"] for t in off["error_model"]["terms"]] == ["placement", "points"]
     assert on["left_out"]["rms"] < 0.3 * on["placement_alone"]["left_out"]["rms"]
     assert on["left_out"]["rms"] < 0.3 * off["left_out"]["rms"]

@@ -92,8 +92,8 @@ def test_gravity_is_found_and_a_term_that_is_not_there_goes() -> None:
     data, _ = simulated(robot, {"gravity": 3e-3}, 40, 5)
     found = fit_error_model(unknown(robot), data, typical())
     worth = {t.name: t for t in found.terms}
-    assert worth["gravity"].kept and worth["gravity"].gain > 10.0 and worth["gravity"].size > 1e-4
-    assert not worth["short"].kept and worth["short"].gain <= 0.0 and worth["short"].size == 0.0
+    assert worth["gravity"].used and worth["gravity"].gain > 10.0 and worth["gravity"].size > 1e-4
+    assert not worth["short"].used and worth["short"].gain <= 0.0 and worth["short"].size == 0.0
     assert set(worth) == {"placement", "gravity", "smooth", "short", "visits", "points"}
 
 
@@ -236,7 +236,7 @@ def test_repetitions_do_not_make_the_left_out_error_kind() -> None:
     distance, _ = fresh_errors(found, data, 25)
     assert found.left_out.rms == pytest.approx(np.sqrt(np.mean(distance**2)), rel=0.25)
     assert left_out(found.solution).rms < 0.3 * found.left_out.rms  # visit by visit
-    assert {t.name: t.kept for t in found.terms}["short"]
+    assert {t.name: t.used for t in found.terms}["short"]
 
 
 # ── updates ──────────────────────────────────────────────────────────────────────────────────────────
@@ -313,5 +313,5 @@ def test_a_measured_irb120() -> None:
     known = known.updated(test[:1, :6], test[:1, None, 6:])
     distance = np.linalg.norm(known.predict(test[1:, :6]).mean[:, 0] - test[1:, 6:], axis=1)
     assert distance.mean() < 1.6e-4
-    assert {t.name: t.kept for t in found.terms}["gravity"]
+    assert {t.name: t.used for t in found.terms}["gravity"]
     assert found.left_out.rms < 2e-4

@@ -65,7 +65,7 @@ def test_a_robot_that_bends_is_predicted_as_well_as_promised() -> None:
     _, _, _, others = bending()
     assert estimate.fit.status == "ok" and estimate.verdict.level == "PASS"
     gravity = next(t for t in estimate.terms if t.name == "gravity")
-    assert gravity.kept and gravity.gain > 10.0 and gravity.size > 2e-4 and 0.0 < gravity.std < gravity.size
+    assert gravity.used and gravity.gain > 10.0 and gravity.size > 2e-4 and 0.0 < gravity.std < gravity.size
     left = estimate.left_out
     assert left.count == 80 and 0.8 < left.predicted_rms / left.rms < 1.25
     judged = validate(problem, estimate, [others])

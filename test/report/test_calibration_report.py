@@ -130,7 +130,7 @@ def test_the_most_important_numbers_are_there(case: Case) -> None:
         ]
         alone += ["validation.placement_"] if "validation" in sets else []
         wanted |= {f"estimate.{name}{k}" for name in alone for k in ("mean", "rms")}
-    wanted |= {f"estimate.error_model.terms.{i}.size" for i, t in enumerate(estimate.terms) if t.kept}
+    wanted |= {f"estimate.error_model.terms.{i}.size" for i, t in enumerate(estimate.terms) if t.used}
     kinds = ("predicted", "parameter") if np.isfinite(estimate.accuracy.predicted).all() else ()
     wanted |= {
         f"estimate.{k}_accuracy_per_test_pose.{i}" for k in kinds for i in range(len(estimate.accuracy.predicted))
@@ -323,7 +323,7 @@ def test_a_measured_robot() -> None:
     assert "It holds placement alone: gravity and joint functions are not in it" in apply
     terms = page.text["accuracy"]
     assert all(t.name in terms and MEANINGS[t.name] in terms for t in estimate.terms)
-    kept = {t.name: t.kept for t in estimate.terms}
+    kept = {t.name: t.used for t in estimate.terms}
     assert kept["gravity"] and terms.count("left out", terms.index("What moves")) == 1 + [*kept.values()].count(
         False
     )
