@@ -36,6 +36,7 @@ from calib_planner.planning import Callback, Plan, PlanProblem, Search, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, independent_seeds, random_deviations
+from calib_planner.tracker import Isotropic
 from calib_planner.units import MILLI_UNIT, milli, signed
 
 RANDOM_PLANS = 12
@@ -130,7 +131,8 @@ def run_demo(
     """
     folder, robot, size = make_folder(folder), Robot.load(ROBOT), (settings.configurations, settings.repetitions)
     search = Search(starts=settings.starts, seed=settings.seed)
-    problem = PlanProblem(robot, [TEST_POSE], *size, noise=settings.sigma, search=search)
+    model = read_error_model(ERROR_MODEL, Isotropic(settings.sigma))
+    problem = PlanProblem(robot, [TEST_POSE], *size, error_model=model, search=search)
     best = plan(problem, callback)
     truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)
     cell = demo_cell(robot, truth_seed, settings.sigma)

@@ -128,7 +128,7 @@ def test_robots(call: Any) -> None:
 
 def test_demo(call: Any, tmp_path: Path) -> None:
     folder = tmp_path / "report"
-    result = call("demo", "--json", "--output", str(folder))
+    result = call("demo", "--json", "--configurations", "20", "--output", str(folder))
     keys = "before after predicted_accuracy random_after random_predicted_accuracy parameters report"
     assert result.keys() >= set(keys.split())
     assert result["parameters"][0].keys() >= {"name", "unit", "true", "value", "std"}
