@@ -94,11 +94,13 @@ def add_links(group: Group) -> None:
     option(group, "--tip-link", "LINK", "last link of the chain in a URDF (its only leaf)")
 
 
-def add_parameters(parser: argparse.ArgumentParser) -> None:
+def add_parameters(parser: argparse.ArgumentParser, unknown: str = "none") -> None:
+    """--parameters and --unknown; ``unknown``: what the help says of the latter's default."""
     group = parser.add_argument_group("what is unknown")
     text = "lengths+offsets, lengths, offsets, full, or NAME,NAME,… (the robot's own; see robots show)"
     option(group, "--parameters", "P", text)
-    text = "base (pose of the robot in the tracker's frame), tool (offsets of the reflectors) or base,tool (none)"
+    text = "base (pose of the robot in the tracker's frame), tool (offsets of the reflectors) or base,tool "
+    text += f"({unknown})"
     group.add_argument("--unknown", default="", metavar="U", help=text)
 
 

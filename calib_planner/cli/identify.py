@@ -36,6 +36,7 @@ from calib_planner.identification import (
     LOSSES,
     Estimate,
     IdentificationProblem,
+    find_misplacement,
     identify,
     validate,
 )
@@ -58,6 +59,7 @@ from calib_planner.io import (
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
+from calib_planner.units import length
 
 EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \
       --unknown base,tool --validate test.csv --validate-target-from 1 --output estimate.yaml"""
@@ -76,7 +78,7 @@ def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "identify", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
-    add_parameters(parser)
+    add_parameters(parser, "found out from the points; none: both are as the robot and --targets say")
     add_data(parser)
     add_noise(parser)
     add_gravity(parser)
@@ -95,6 +97,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     settings = source_settings(args, terminal)
     noise_given = args.sigma is not None or args.instrument is not None
     sources = read_sources(args.data, robot, settings, noise_given=noise_given)
+    _find_unknown(robot, sources, args, terminal)
     robot = _with_targets(robot, sources, args)
     problem = _problem(robot, sources, args, terminal)
     held_out = [_held_out(path, robot, args, settings) for path in args.validate or ()]
@@ -148,6 +151,35 @@ def _held_out(path: str, robot: Robot, args: argparse.Namespace, settings: Sourc
         got = f"points of {count} targets"
         raise FileFormatError(path, "header", got, f"at most {most}, as in --data", advice)
     return data
+
+
+def _find_unknown(robot: Robot, sources: Sources, args: argparse.Namespace, terminal: Terminal) -> None:
+    """What --unknown leaves open: base and tool are unknown if the points fit a robot that stands elsewhere."""
+    if args.unknown:
+        args.unknown = "" if args.unknown.strip() == KNOWN else args.unknown
+        return
+    count = sources.data.p.shape[1]
+    strange = len(robot.targets) != count
+    if strange and args.targets is not None:
+        return  # which is refused
+    answer = find_misplacement(robot.with_targets(np.zeros((count, 3))) if strange else robot, sources.data)
+    unknown = [w for w in ("base", "tool") if w in answer.unknown or (strange and w == "tool")]
+    args.unknown = ",".join(unknown)
+    if answer.unknown:
+        words = " and ".join({"base": "the base", "tool": "the reflectors"}[w] for w in unknown)
+        placed = (
+            f"{length(answer.after)} with {words} where the points put {'it' if len(unknown) == 1 else 'them'}"
+        )
+        terminal.note(
+            f"The points are {length(answer.before)} from the robot as it is stated, and {placed}: "
+            f"--unknown {args.unknown} was taken (--unknown {KNOWN} if the places are known)."
+        )
+    elif strange:
+        terminal.note(f"The robot has no place for {count} reflectors: --unknown tool was taken.")
+
+
+KNOWN = "none"
+"""Value of --unknown for a base and targets that are as the robot and --targets say."""
 
 
 def _with_targets(robot: Robot, sources: Sources, args: argparse.Namespace) -> Robot:

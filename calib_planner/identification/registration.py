@@ -196,6 +196,9 @@ MISPLACED = 0.02
 NO_BETTER = 2.0
 """Of two explanations the simpler one is taken unless the other is this many times closer."""
 
+EXPLAINED = 0.1
+"""A place that leaves more of the distances than this share explains nothing: units or joints are wrong."""
+
 
 @dataclass(frozen=True)
 class Misplacement:
@@ -224,6 +227,7 @@ def find_misplacement(robot: Robot, data: Measurements) -> Misplacement:
     best = Misplacement((), before, before)
     if not before > MISPLACED or 3 * int(seen.sum()) <= 6 + 3 * seen.shape[1]:
         return best
+    nothing = best
     for unknown in (("tool",), ("base",), ("base", "tool")):
         try:
             base, tool = "base" in unknown, "tool" in unknown
@@ -232,7 +236,7 @@ def find_misplacement(robot: Robot, data: Measurements) -> Misplacement:
             continue
         if after * NO_BETTER < best.after:
             best = Misplacement(unknown, before, after)
-    return best
+    return best if best.after < EXPLAINED * before else nothing
 
 
 def _median(robot: Robot, data: Measurements) -> float:

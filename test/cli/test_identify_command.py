@@ -12,6 +12,7 @@ from identify_runs import Run, fails, small_data
 from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations
 
 from calib_planner import Measurements, Robot
+from calib_planner.cli import main
 from calib_planner.io import read_estimate, write_measurements
 from calib_planner.io.kinematics import read_kinematics
 from calib_planner.simulation import SimulatedCell
@@ -340,3 +341,34 @@ def test_irb120_with_its_held_out_files(run: Run, tmp_path: Path) -> None:
     robot = Robot.load(IRB / "irb120.urdf")
     again = read_estimate(output).calibrated(robot)
     assert len(again.targets) == 3 and again.parameter_names == tuple(p["name"] for p in result["parameters"])
+
+
+# ── what nobody said: where robot and reflectors are ─────────────────────────────────────────────────
+
+
+def test_base_and_tool_are_found_out_and_said(
+    run: Run, arm: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``identify --robot R --data D`` alone: the tracker stands anywhere, the file has two reflectors."""
+    urdf, data = arm
+    given = run("--robot", urdf, "--data", data, "--unknown", "base,tool")
+    alone = run("--robot", urdf, "--data", data)
+    assert main(["identify", "--robot", str(urdf), "--data", str(data)]) == 0
+    said = capsys.readouterr().err
+    assert "--unknown base,tool was taken" in said and "--unknown none" in said
+    assert [p["name"] for p in alone["parameters"]] == [p["name"] for p in given["parameters"]]
+    np.testing.assert_array_equal(values(alone), values(given))
+
+
+def test_places_that_are_known_are_left_alone(
+    run: Run, points: Path, arm: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["identify", "--robot", "planar_2r", "--data", str(points)]) == 0
+    assert "--unknown" not in capsys.readouterr().err
+    alone = run("--robot", "planar_2r", "--data", points)
+    known = run("--robot", "planar_2r", "--data", points, "--unknown", "none")
+    np.testing.assert_array_equal(values(alone), values(known))
+    assert not any(p["name"].startswith(("base.", "target_")) for p in alone["parameters"])
+    urdf, data = arm
+    status, line = fails(capsys, "--robot", urdf, "--data", data, "--unknown", "none")
+    assert status == 1 and "--unknown tool" in line
