@@ -41,7 +41,7 @@ ROOMS: dict[str, str] = {
     "simulation": "robot tracker error_model acquisition planning identification campaign",
     "io": "robot tracker error_model acquisition planning identification compensation campaign",
     "report": "robot tracker error_model planning identification io",
-    "demo": "robot error_model planning identification simulation io report",
+    "demo": "robot tracker error_model planning identification simulation io report",
     "cli": "robot tracker error_model acquisition planning identification compensation campaign simulation io "
     "report demo",
     "ros": "robot tracker error_model acquisition planning identification campaign simulation io report demo",

@@ -41,6 +41,7 @@ from calib_planner.cli.arguments import (
     require_test_poses,
     test_poses,
 )
+from calib_planner.cli.gravity import add_gravity, error_model_of
 from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError
@@ -96,6 +97,7 @@ def add(commands: Commands, summary: str) -> None:
     add_conditions(work)
     text = "how the robot errs, for the identification: typical, paper (noise alone), or YAML, also an estimate"
     option(work, "--error-model", "E", text, "typical")
+    add_gravity(parser, measured=False)
     hand = parser.add_argument_group("by hand")
     option(hand, "--measured", "FILE", "CSV of what was measured for the fit so far")
     option(hand, "--held-out", "FILE", "CSV of what was measured for validation")
@@ -147,7 +149,7 @@ def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:
         sigma=args.sigma,
         **conditions(args, robot),
         accuracy_frame=args.accuracy_frame,
-        identification={"error_model": read_error_model(args.error_model)},
+        identification={"error_model": error_model_of(args, args.error_model, robot)},
         starts=args.starts,
         seed=args.seed,
     )
@@ -206,6 +208,8 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
     check_number("--simulate-sigma", sigma, low=0, high=1, unit="m")
     check_number("--simulate-transmission", args.simulate_transmission, low=0, high=0.1, unit="rad")
     model = read_error_model(args.simulate_error_model)
+    if model.gravity is not None:
+        model = error_model_of(args, args.simulate_error_model, problem.robot)
     same = args.simulate_sigma is None and args.instrument is not None
     noise = problem.noise if same else None
     with terminal.progress("measuring") as update:

@@ -15,6 +15,7 @@ from calib_planner.io import read_error_model, read_vertical
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 
+MOUNTING = 'floor|ceiling|"x y z"'
 MOUNTED = ("on the floor", "under a ceiling", "on a wall", "tilted")
 STEEP = 0.94
 """Cosine of 20°: what is nearer than this to a floor, a ceiling or a wall is called so."""
@@ -26,12 +27,16 @@ def add_payload(group: Group, otherwise: str) -> None:
     option(group, "--payload", '"MASS X Y Z"', f"{text} ({otherwise})", kind=numbers)
 
 
-def add_gravity(parser: argparse.ArgumentParser) -> None:
-    """--payload, --mounting and --vertical."""
+def add_gravity(parser: argparse.ArgumentParser, *, measured: bool = True) -> None:
+    """--payload and --mounting; --vertical and a column of payloads for what is ``measured`` by the user."""
     group = parser.add_argument_group("what gravity does to the robot")
-    add_payload(group, "not known; a column payload [kg] of the measurements says what each visit carried")
+    column = "; a column payload [kg] of the measurements says what each visit carried" if measured else ""
+    add_payload(group, f"not known{column}")
     text = "floor, ceiling, or the direction downwards in the frame of the robot's base, as for a robot on a wall"
-    option(group, "--mounting", 'floor|ceiling|"x y z"', f"{text} (floor, or as --vertical says)")
+    option(group, "--mounting", MOUNTING, f"{text} (floor{', or as --vertical says' if measured else ''})")
+    parser.set_defaults(vertical=None)
+    if not measured:
+        return
     text = "the direction upwards in the frame of the points: with the identified base it says how it is mounted"
     option(group, "--vertical", '"x y z"', f"{text} (up of --instrument, if its file says it)", kind=numbers)
 
@@ -55,22 +60,33 @@ def payload_of(args: argparse.Namespace) -> tuple[float, tuple[float, float, flo
     return given[0], (x, y, z)
 
 
-def error_model_of(args: argparse.Namespace, robot: Robot, data: Measurements) -> ErrorModel:
-    """The error model of --error-model, its gravity as the robot's file and the options of ``add_gravity`` say.
+def error_model_of(
+    args: argparse.Namespace, source: str, robot: Robot, data: Measurements | None = None
+) -> ErrorModel:
+    """The error model of a name or file, its gravity as the robot's file and the options of ``add_gravity`` say.
+
+    Raises:
+        InputError, FileFormatError: As ``with_gravity_of`` and ``read_error_model``.
+    """
+    model = read_error_model(source)
+    if model.gravity is not None and model.name == source:
+        model = replace(model, gravity=gravity_of(robot))
+    return with_gravity_of(args, model, data)
+
+
+def with_gravity_of(args: argparse.Namespace, model: ErrorModel, data: Measurements | None = None) -> ErrorModel:
+    """The error model with what the options of ``add_gravity`` say of gravity; ``data``: the user's, if any.
 
     Raises:
         InputError: An option that contradicts another, or that the error model has no use for.
-        FileFormatError: As ``read_error_model``.
     """
     given = [name for name in ("payload", "mounting", "vertical") if getattr(args, name) is not None]
-    model = read_error_model(args.error_model)
     if model.gravity is None:
         if given:
-            got, advice = f"the error model {model.name}, without gravity", "leave the option out"
+            got, advice = f"the error model {model.name}, without gravity", "give --error-model typical"
             raise InputError(f"--{given[0]}", got, "an error model with gravity", advice)
         return model
-    gravity = gravity_of(robot) if model.name == args.error_model else model.gravity
-    return replace(model, gravity=_mounted(args, _loaded(args, gravity, data)))
+    return replace(model, gravity=_mounted(args, _loaded(args, model.gravity, data), data))
 
 
 def gravity_note(gravity: Gravity | None, stated: Gravity, robot: Robot) -> str:
@@ -99,18 +115,18 @@ def mounted(down: FloatArray) -> str:
     return next((word for word, share in zip(MOUNTED, cases, strict=False) if share > STEEP), MOUNTED[-1])
 
 
-def _loaded(args: argparse.Namespace, gravity: Gravity, data: Measurements) -> Gravity:
+def _loaded(args: argparse.Namespace, gravity: Gravity, data: Measurements | None) -> Gravity:
     """With the payload that is stated; where its mass is in the measurements alone, the heaviest."""
     stated = payload_of(args)
     if stated is None:
         return gravity
     mass, place = stated
-    if not mass and data.payload is not None:
+    if not mass and data is not None and data.payload is not None:
         mass = float(np.asarray(data.payload).max())
     return gravity.with_payload(Payload(mass, place) if mass else None)
 
 
-def _mounted(args: argparse.Namespace, gravity: Gravity) -> Gravity:
+def _mounted(args: argparse.Namespace, gravity: Gravity, data: Measurements | None) -> Gravity:
     """With the mounting that is stated, or the vertical from which it follows."""
     if args.mounting is not None:
         if args.vertical is not None:
@@ -119,7 +135,7 @@ def _mounted(args: argparse.Namespace, gravity: Gravity) -> Gravity:
             )
         return replace(gravity, mounting=_mounting(args.mounting), vertical=None)
     vertical = args.vertical
-    if vertical is None and getattr(args, "instrument", None) is not None:
+    if vertical is None and data is not None and args.instrument is not None:
         vertical = read_vertical(args.instrument)
     if vertical is None:
         return gravity

@@ -118,7 +118,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
 def _problem(
     robot: Robot, sources: Sources, args: argparse.Namespace, terminal: Terminal
 ) -> IdentificationProblem:
-    model = error_model_of(args, robot, sources.data)
+    model = error_model_of(args, args.error_model, robot, sources.data)
     if args.prior == TYPICAL:
         model = with_tolerances(model)
     return IdentificationProblem(

@@ -31,6 +31,7 @@ from calib_planner.cli.arguments import (
     switch,
     test_poses,
 )
+from calib_planner.cli.gravity import add_gravity, with_gravity_of
 from calib_planner.cli.sheet import tell_sheet
 from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, gravity_of, typical_prior
@@ -189,6 +190,7 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     option(work, "--error-model", "E", text)
     text = "error of one coordinate that repeating a configuration does not average away [m]"
     option(work, "--configuration-sigma", "S", text, 0.0)
+    add_gravity(parser, measured=False)
     known = parser.add_argument_group("what is known beforehand")
     text = "YAML: parameter name to standard deviation [m | rad], or a prior as for identify, but no estimate; "
     text += f"{TYPICAL}: the data sheet within usual manufacturing errors (none)"
@@ -228,7 +230,7 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
     candidates, compound = _candidates(args, robot), _compound(getattr(args, "compound", []))
     around = conditions(args, robot)
     prior = _prior(args.prior, robot)
-    model = _error_model(args, robot, around["noise"])
+    model = with_gravity_of(args, _error_model(args, robot, around["noise"]))
     std: dict[str, float] = {}
     if prior is not None and model.is_papers:
         std = _independent(args.prior, prior)

@@ -22,10 +22,11 @@ from calib_planner.cli.arguments import (
     load_robot,
     option,
 )
+from calib_planner.cli.gravity import add_gravity, error_model_of
 from calib_planner.cli.terminal import Terminal
 from calib_planner.error_model import to_mapping
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.io import measurements_text, read_error_model, read_plan, read_plan_csv, write_measurements
+from calib_planner.io import measurements_text, read_plan, read_plan_csv, write_measurements
 from calib_planner.robot import Robot
 from calib_planner.simulation import (
     ANGLE_ERROR,
@@ -58,6 +59,7 @@ def add(commands: Commands, summary: str) -> None:
     add_seed(truth)
     text = "seed of what is new at each measurement, for another set of the same robot (drawn from --seed)"
     option(truth, "--noise-seed", "N", text, kind=int)
+    add_gravity(parser, measured=False)
     option(parser, "--output", "FILE", "CSV of measurements (stdout without --json)")
 
 
@@ -78,7 +80,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     if args.noise_seed is not None:
         noise_seed = check_count("--noise-seed", args.noise_seed, low=0, high=2**63 - 1)
     errors = _true_errors(robot, args, truth_seed)
-    model = read_error_model(args.error_model)
+    model = error_model_of(args, args.error_model, robot)
     cell = SimulatedCell(robot, errors, args.sigma, error_model=model, seed=truth_seed)
     data = cell.measure(configurations, repetitions, noise_seed)
     result = {

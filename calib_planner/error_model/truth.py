@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from calib_planner.arrays import FloatArray, check_configurations
 from calib_planner.error_model.joint_functions import JointFunctions
 from calib_planner.error_model.model import ErrorModel, Scale
+from calib_planner.error_model.placement import Placement, is_placement
 from calib_planner.error_model.poses import Poses, joint_units
 from calib_planner.error_model.visits import Visits
 from calib_planner.robot import Robot
@@ -177,7 +178,7 @@ class Truth:
         """Term or component → root mean square of what it moves the targets by at ``q`` (N, joints) [m].
 
         The names are those of ``identify``. Visits and points count by their variance, the others by their
-        coefficients.
+        coefficients, base and targets not among them: where these stand is no error of the robot.
         """
         clean = check_configurations("configurations", q, self.robot.joint_names)
         model, robot = self.model, self.robot
@@ -186,6 +187,8 @@ class Truth:
         squares: dict[str, float] = {}
         for term in model.systematic:
             columns, own = term.columns(poses), self.coefficients[where[term.name]]
+            if isinstance(term, Placement):
+                own = np.where(is_placement(robot.parameter_names), own, 0.0)
             parts: dict[str, FloatArray] = {term.name: np.ones(len(own))}
             if isinstance(term, JointFunctions):
                 parts = term.shares(robot, model.values)

@@ -47,6 +47,8 @@ def true_robot() -> Truth:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files: what was measured with several payloads, and fresh points with 4 kg."""
     place, truth = tmp_path_factory.mktemp("gravity"), true_robot()
+    some = random_configurations(truth.robot, 20, 1) / 3.0
+    write_configurations(place / "candidates.csv", truth.robot.joint_names, some)
     for name, count, masses in (("fit", 45, MASSES[np.arange(45) % 3]), ("fresh", 30, np.full(30, 4.0))):
         q = random_configurations(truth.robot, count, count) / 3.0
         points = truth.measure(q, np.random.default_rng(count), masses)
@@ -187,3 +189,38 @@ def test_compensate_knows_no_payload_that_was_not_measured(
     files = ("--estimate", str(tmp_path / "e.yaml"), "--targets", str(tmp_path / "q.csv"))
     assert main(["compensate", "--robot", "ur10e", *files, "--json", "--payload", "2"]) == 2
     assert "identify with --payload" in capsys.readouterr().err
+
+
+def test_plan_and_simulate_take_payload_and_mounting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], folder: Path
+) -> None:
+    more = ("--payload", "5 0 0 0.1", "--mounting", "1 0 0")
+    write_configurations(tmp_path / "q.csv", Robot.load("ur10e").joint_names, np.full((3, 6), 0.4))
+    simulate = ("simulate", "--robot", "ur10e", "--plan", str(tmp_path / "q.csv"), "--json", "--sigma", "0")
+    results = []
+    for words in (more, more[:2], ()):
+        assert main([*simulate, *words]) == 0
+        results.append(json.loads(capsys.readouterr().out))
+    gravity = gravity_of(results[0])
+    assert gravity["mounting"] == [1.0, 0.0, 0.0] and gravity["payload"]["mass"] == 5.0
+    assert len({json.dumps(r["points"]) for r in results}) == 3
+    plan = (
+        "plan",
+        "--robot",
+        "ur10e",
+        "--parameters",
+        "offsets",
+        "--configurations",
+        "8",
+        "--starts",
+        "1",
+        "--json",
+    )
+    plan = (*plan, "--test-pose", "0.4 -1 1 0.5 0.5 0", "--unknown", "base,tool")
+    promised = []
+    for words in (more, ()):
+        assert main([*plan, *words, "--candidates", str(folder / "candidates.csv")]) == 0
+        promised.append(json.loads(capsys.readouterr().out)["predicted_accuracy"])
+    assert promised[0] != promised[1]
+    assert main([*plan, "--error-model", "paper", *more]) == 2
+    assert "--error-model typical" in capsys.readouterr().err

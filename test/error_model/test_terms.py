@@ -124,9 +124,7 @@ def test_a_mass_on_a_link_loads_only_the_joints_before_it(robot: Robot) -> None:
     q = random_configurations(robot, 3)
     other = q.copy()
     other[:, 2:] += 0.3
-    np.testing.assert_allclose(
-        gravity.moments(Poses(robot, q)), gravity.moments(Poses(robot, other)), atol=1e-12
-    )
+    np.testing.assert_allclose(gravity.moments(Poses(robot, q)), gravity.moments(Poses(robot, other)), atol=1e-12)
 
 
 def test_parts_of_one_mass_share_coefficients_and_the_payload_follows_the_visit(robot: Robot) -> None:

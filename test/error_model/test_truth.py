@@ -211,6 +211,8 @@ def test_sizes_are_what_the_terms_move_the_targets_by() -> None:
     assert set(told) == {"placement", "gravity", "smooth", "short", "visits", "points"}
     placed = replace(truth, robot=robot).positions(q)
     assert told["placement"] == pytest.approx(rms(points - placed), rel=1e-3)
+    moved = Truth.draw(robot, model, np.random.default_rng(1), {robot.parameter_names[0]: 1e-3, "base.x": 2.0})
+    assert moved.sizes(q)["placement"] < 5e-3
     where = model.slices(robot)
     rigid = truth.coefficients.copy()
     rigid[where["gravity"]] = 0.0
