@@ -30,8 +30,7 @@ import numpy as np
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, Knowledge, Truth, typical
-from calib_planner.identification import ModelEstimate, fit_error_model
-from calib_planner.identification.doubt import gate_of
+from calib_planner.identification import ModelEstimate, fit_error_model, gate_of
 from calib_planner.io import read_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Element
