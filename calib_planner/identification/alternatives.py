@@ -310,6 +310,7 @@ class _Question:
         row: That visit, once it is decided.
         target, joint, beside, parameter: What it concerns; targets and joints from 0.
         rows: Visits that it concerns where these are a run.
+        whole: (N, m, d) the columns from the first visit on, once the visit is decided.
     """
 
     code: str
@@ -322,11 +323,13 @@ class _Question:
     beside: int | None = None
     parameter: str | None = None
     rows: tuple[int, ...] = ()
+    whole: FloatArray | None = None
 
     def at(self, row: int) -> _Question:
         """With the visit before which it began."""
-        columns = self.columns * (np.arange(len(self.columns)) >= row)[:, None, None]
-        return replace(self, columns=columns, row=row, cut=False)
+        whole = self.columns if self.whole is None else self.whole
+        columns = whole * (np.arange(len(whole)) >= row)[:, None, None]
+        return replace(self, columns=columns, whole=whole, row=row, cut=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -633,8 +636,17 @@ class _Fine:
     ) -> tuple[Alternative, _Base] | None:
         """The alternative, and the linear problem with it; ``None``: it explains nothing."""
         question, count = answer.question, base.problem.columns.shape[2]
-        solution, doubt = self._settled(_widened(self._with(base.problem, doubt), question.columns), doubt)
-        null = solve(self._with(base.problem.at(solution.problem.model), doubt))
+        for _ in range(2):
+            wide = _widened(self._with(base.problem, doubt), question.columns)
+            solution, after = self._settled(wide, doubt)
+            null = solve(self._with(base.problem.at(solution.problem.model), after))
+            if question.whole is None or self._many:
+                break
+            row = self._row_again(question, null, after)
+            if row == question.row:
+                break
+            question = question.at(row)
+        doubt = after
         again = _answer(null, question, _statistics(null, [question.columns])[0], answer.count)
         score = left_out(solution).score
         if not (again.counted < SIGNIFICANT and score > base.score):
@@ -682,6 +694,17 @@ class _Fine:
         return replace(told, material=deviations > MATERIAL), _Base(
             problem, doubt, solution.coefficients, score, base.there
         )
+
+    def _row_again(self, question: _Question, null: Solution, doubt: FloatArray) -> int:
+        """The visit before which it began, at scales that no longer hold what the columns explain."""
+        assert question.whole is not None and question.row is not None
+        near = slice(max(question.row - 2, 0), question.row + 2)
+        if doubt[near].any():  # a visit on the wrong side of the cut was impossible there
+            lifted = np.array(doubt)
+            lifted[near] = 0.0
+            null = solve(self._with(null.problem, lifted))
+        cuts = np.arange(FEWEST, len(self.data) - FEWEST + 1)
+        return self._best_cut(null, replace(question, columns=question.whole), cuts)[0]
 
     def _settled(self, problem: LinearProblem, doubt: FloatArray) -> tuple[Solution, FloatArray]:
         """The solution with new scales; points that are possible now count, and those that are not do not."""
