@@ -423,7 +423,7 @@ class Estimate:
         seconds: Time spent.
         validation: Statistics on held-out data, if any was given.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.
-        fits: The fits behind it, of all terms and of placement alone; an update begins with them.
+        model_fit: The fit behind it, from which an update begins; ``None`` for an estimate that was read.
     """
 
     calibrated: Robot
@@ -440,14 +440,14 @@ class Estimate:
     seconds: float
     validation: Validation | None = None
     verdict: Verdict = UNJUDGED
-    fits: tuple[ModelEstimate, ModelEstimate] | None = field(default=None, repr=False)
+    model_fit: ModelEstimate | None = field(default=None, repr=False)
 
     @property
     def scale_spread(self) -> dict[str, float]:
         """Scale of the error model that the data decide → standard deviation of its logarithm."""
-        if self.fits is None:
+        if self.model_fit is None:
             return {}
-        names, covariance = self.fits[0].origin.scales
+        names, covariance = self.model_fit.origin.scales
         return dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
     def positions(self, q: ArrayLike) -> FloatArray:

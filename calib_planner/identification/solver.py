@@ -32,7 +32,7 @@ from calib_planner.identification.estimate import (
     Residuals,
     residual_statistics,
 )
-from calib_planner.identification.estimation import ModelEstimate, fit_error_model
+from calib_planner.identification.estimation import ModelEstimate, fit_error_model, placement_alone
 from calib_planner.identification.left_out import LeftOut
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
@@ -53,8 +53,13 @@ WRONG_UNIT = (200.0, 5000.0)
 
 
 @one_thread
-def identify(problem: IdentificationProblem) -> Estimate:
+def identify(problem: IdentificationProblem, start: Estimate | None = None) -> Estimate:
     """Identify the active parameters and all else that the error model has.
+
+    Args:
+        problem: What is to be identified, from what.
+        start: An estimate of the same robot by the same error model from most of these data, which is brought up
+            to date at its own scales and terms: many times quicker. A full fit is made where that does not do.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknown parameters, or most points disagree.
@@ -67,19 +72,13 @@ def identify(problem: IdentificationProblem) -> Estimate:
     # A fit may run so far along what it cannot see that it seems to see it: this is decided first at the start.
     rows = np.repeat(problem.data.seen, 3, axis=1)
     hidden = _hidden(problem.model, robot, robot.jacobian(problem.data.q)[rows])
-    fit = _fit(problem, problem.model, robot, hidden)
+    fit = _fit(problem, robot, hidden, None if start is None else start.model_fit)
     if fit.knowledge.hidden.shape[1]:
-        hidden = _hidden(
-            problem.model, robot, fit.knowledge.poses(problem.data.q, problem.data.payload).jacobian[rows]
-        )
-        fit = _fit(problem, problem.model, robot, hidden)
+        poses = fit.knowledge.poses(problem.data.q, problem.data.payload)
+        hidden = _hidden(problem.model, robot, poses.jacobian[rows])
+        fit = _fit(problem, robot, hidden)
     check_count(problem, problem.data.seen & (fit.doubt == 0.0))
-    alone = fit
-    if len(fit.knowledge.model.systematic) > 1:
-        used = problem.data.without(_points(fit.doubt))
-        terms = replace(problem.model, gravity=None, joint_functions=None)
-        alone = _fit(replace(problem, data=used, error_model=terms), terms, robot, hidden)
-    return _estimate(problem, fit, alone, hidden, robot, began)
+    return _estimate(problem, fit, hidden, robot, began)
 
 
 # ── before the fit ───────────────────────────────────────────────────────────────────────────────────
@@ -143,14 +142,17 @@ def _extent(points: FloatArray) -> float:
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
-def place_nominal(problem: IdentificationProblem) -> Robot:
-    """The nominal kinematics with base and targets, where they are unknown, fitted to the data."""
+def place_nominal(problem: IdentificationProblem, start: Robot | None = None) -> Robot:
+    """The nominal kinematics with base and targets, where they are unknown, fitted to the data.
+
+    ``start``: ``start_robot`` of the same data, if it is known already.
+    """
     active = set(problem.robot.parameter_names)
     groups = (BASE_PARAMETERS, target_parameters(len(problem.robot.targets)))
     names = [n for group in groups if active.issuperset(group) for n in group]
     if not names:
         return problem.robot
-    robot = start_robot(problem.robot, problem.data, robust=problem.robust)
+    robot = start_robot(problem.robot, problem.data, robust=problem.robust) if start is None else start
     known = fit_error_model(replace(robot, parameter_names=tuple(names)), problem.data, ErrorModel.paper(1e-3))
     return replace(known.knowledge.placed, parameter_names=robot.parameter_names)
 
@@ -211,24 +213,25 @@ def _blind_poses(problem: IdentificationProblem, robot: Robot, directions: Float
 
 
 def _fit(
-    problem: IdentificationProblem, model: ErrorModel, robot: Robot, hidden: Identifiability
+    problem: IdentificationProblem, robot: Robot, hidden: Identifiability, start: ModelEstimate | None = None
 ) -> ModelEstimate:
-    """The fit without one parameter of each hidden combination; all of them are in its knowledge again."""
-    names = robot.parameter_names
-    free = tuple(n for i, n in enumerate(names) if i not in hidden.fixed)
-    if not hidden.fixed or not free:
-        return fit_error_model(robot, problem.data, model, robust=problem.robust)
-    fit = fit_error_model(replace(robot, parameter_names=free), problem.data, model, robust=problem.robust)
-    known = fit.knowledge
-    own = known.model.names(replace(known.robot, parameter_names=names))
+    """The fit without one parameter of each hidden combination; these are in no part of it."""
+    free = tuple(n for i, n in enumerate(robot.parameter_names) if i not in hidden.fixed)
+    seen = replace(robot, parameter_names=free or robot.parameter_names)
+    return fit_error_model(seen, problem.data, problem.model, robust=problem.robust, start=start)
+
+
+def _with_fixed(known: Knowledge, names: tuple[str, ...]) -> Knowledge:
+    """With all parameters ``names``; those that it does not have are at their nominal values, without doubt."""
+    robot = replace(known.robot, parameter_names=names)
+    own = known.model.names(robot)
     place = [own.index(n) for n in known.model.names(known.robot)]
     coefficients, covariance = np.zeros(len(own)), np.zeros((len(own), len(own)))
     coefficients[place] = known.coefficients
     covariance[np.ix_(place, place)] = known.covariance
     unseen = np.zeros((len(own), known.hidden.shape[1]))
     unseen[place] = known.hidden
-    placed = replace(known.robot, parameter_names=names)
-    return replace(fit, knowledge=Knowledge(placed, known.model, coefficients, covariance, unseen))
+    return Knowledge(robot, known.model, coefficients, covariance, unseen)
 
 
 # ── the parts of the estimate ────────────────────────────────────────────────────────────────────────
@@ -237,14 +240,13 @@ def _fit(
 def _estimate(
     problem: IdentificationProblem,
     fit: ModelEstimate,
-    alone: ModelEstimate,
     hidden: Identifiability,
     start: Robot,
     began: float,
 ) -> Estimate:
     """The answer, with its verdict."""
-    known, data, model = fit.knowledge, problem.data, problem.model
-    names = known.robot.parameter_names
+    data, model, names = problem.data, problem.model, start.parameter_names
+    known, alone = _with_fixed(fit.knowledge, names), placement_alone(fit)
     seen, use = data.seen, data.seen & (fit.doubt == 0.0)
     deviations, covariance = known.coefficients[: len(names)], known.covariance[: len(names), : len(names)]
     std = np.sqrt(np.diag(covariance))
@@ -254,7 +256,7 @@ def _estimate(
     residuals = data.p - predicted
     normalised = np.where(seen, np.sqrt(squares_of_points(fit.solution, fit.doubt)[0]), np.nan)
     gate = float(np.sqrt(gate_of(int(seen.sum()))))
-    before = data.p - place_nominal(problem).positions(data.q)
+    before = data.p - place_nominal(problem, start).positions(data.q)
     source = problem.noise_source
     linear, rank = fit.solution.problem, len(names) - len(hidden.fixed)
     flat, spare = linear.basis.shape[1], 3 * int(use.sum()) - rank
@@ -263,7 +265,7 @@ def _estimate(
     rows = start.jacobian(data.q)[np.repeat(seen, 3, axis=1)]
     off = _point_rows(problem, predicted, normalised, seen & ~use, gate)
     suspects = _point_rows(problem, predicted, normalised, use & (np.nan_to_num(normalised) > gate), gate)
-    calibrated = alone.knowledge.placed
+    calibrated = _with_fixed(alone.knowledge, names).placed
     estimate = Estimate(
         calibrated=calibrated,
         knowledge=known,
@@ -308,10 +310,10 @@ def _estimate(
         noise=PointNoise(_point_sigma(fit, use), source),
         accuracy=_accuracy(problem, known, calibrated, _blind_poses(problem, start, hidden.directions)),
         left_out=_left_out_error(fit.left_out, fit, source),
-        placement_alone=_left_out_error(alone.left_out, alone, source),
+        placement_alone=_left_out_error(alone.left_out, fit, source),
         terms=fit.terms,
         seconds=time.perf_counter() - began,
-        fits=(fit, alone),
+        model_fit=fit,
     )
     return judged(estimate)
 
@@ -322,11 +324,6 @@ def _prior_words(model: ErrorModel) -> str:
     if stated is not None:
         return stated.source
     return "" if model.placement.prior == "flat" else f"the tolerances of the error model '{model.name}'"
-
-
-def _points(doubt: FloatArray) -> list[RejectedPoint]:
-    """Those that lost their weight, for ``Measurements.without``."""
-    return [RejectedPoint(i, t + 1, "", np.nan, np.nan) for i, t in np.argwhere(doubt > 0.0).tolist()]
 
 
 def _left_out_error(left: LeftOut, fit: ModelEstimate, source: str) -> LeftOutError:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import bare
+from cells import bare, plain_cell
 from robots import random_configurations
 
 from calib_planner import Estimate, IdentificationProblem, Measurements, Robot, identify, validate
@@ -195,3 +195,44 @@ def test_accuracy_frames_that_cannot_be_had_are_refused(field: str, options: dic
     with pytest.raises(InputError) as error:
         IdentificationProblem(robot, data, **{"error_model": typical()} | options)
     assert error.value.field == field
+
+
+# ── an update ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_an_estimate_brought_up_to_date_is_that_of_all_measurements_at_once() -> None:
+    """Two visits come, one goes; scales and terms are those of before, so that a little may differ."""
+    robot, _, data, _ = bending()
+    first = identify(IdentificationProblem(robot, data.select(np.arange(38))))
+    now = IdentificationProblem(robot, data.select(np.r_[1:40]), test_poses=POSES / 2.0)
+    quick, full = identify(now, first), identify(now)
+    assert quick.fit.iterations <= 2 < full.fit.iterations
+    assert quick.points == full.points and quick.verdict.level == full.verdict.level
+    q = random_configurations(robot, 30, 4) / 3.0
+    apart = np.linalg.norm(quick.positions(q) - full.positions(q), axis=2)
+    assert np.sqrt(np.mean(apart**2)) < 0.2 * full.accuracy.overall
+    np.testing.assert_allclose(quick.accuracy.predicted, full.accuracy.predicted, rtol=0.2)
+    assert quick.left_out.rms == pytest.approx(full.left_out.rms, rel=0.1)
+
+
+def test_a_wrong_measurement_undone_leaves_no_trace() -> None:
+    robot, _, data, _ = bending()
+    before = identify(IdentificationProblem(robot, data))
+    points = np.array(data.p)
+    points[39] += 0.4
+    wrong = identify(IdentificationProblem(robot, bare(data, points)), before)
+    assert {p.row for p in wrong.points.rejected} == {39}
+    after = identify(IdentificationProblem(robot, data), wrong)
+    assert not after.points.rejected
+    np.testing.assert_allclose(
+        after.fit.deviations, before.fit.deviations, rtol=0, atol=1e-2 * before.fit.std.min()
+    )
+
+
+def test_a_start_of_another_robot_is_no_start() -> None:
+    """It cannot be brought up to date: a full fit is made, and says the same as without it."""
+    robot, _, data, _ = bending()
+    cell, kuka = plain_cell(2)
+    other = identify(IdentificationProblem(kuka, bare(cell.measure(random_configurations(kuka, 12, 2), 1, 2))))
+    problem = IdentificationProblem(robot, data)
+    np.testing.assert_array_equal(identify(problem, other).fit.deviations, identify(problem).fit.deviations)
