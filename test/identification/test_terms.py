@@ -216,6 +216,7 @@ def test_an_estimate_brought_up_to_date_is_that_of_all_measurements_at_once() ->
 
 
 def test_a_wrong_measurement_undone_leaves_no_trace() -> None:
+    """Scales may have been estimated beside it; predictions are the same within a fifth of their error."""
     robot, _, data, _ = bending()
     before = identify(IdentificationProblem(robot, data))
     points = np.array(data.p)
@@ -224,9 +225,9 @@ def test_a_wrong_measurement_undone_leaves_no_trace() -> None:
     assert {p.row for p in wrong.points.rejected} == {39}
     after = identify(IdentificationProblem(robot, data), wrong)
     assert not after.points.rejected
-    np.testing.assert_allclose(
-        after.fit.deviations, before.fit.deviations, rtol=0, atol=1e-2 * before.fit.std.min()
-    )
+    q = random_configurations(robot, 30, 4) / 3.0
+    apart = np.linalg.norm(after.positions(q) - before.positions(q), axis=2)
+    assert np.sqrt(np.mean(apart**2)) < 0.2 * before.knowledge.accuracy(q).value
 
 
 def test_a_start_of_another_robot_is_no_start() -> None:
