@@ -14,6 +14,7 @@ from robots import random_configurations
 
 from calib_planner import Robot
 from calib_planner.cli import main
+from calib_planner.cli.gravity import gravity_note
 from calib_planner.error_model import Gravity, Payload, Truth, typical
 from calib_planner.io import read_estimate, write_configurations, write_error_model, write_measurements
 from calib_planner.measurements import Measurements
@@ -72,14 +73,16 @@ PAYLOAD = ("--payload", "6 0.05 0 0.15")
 
 def test_the_vertical_of_the_points_says_how_the_robot_is_mounted(run: Run, words: tuple[str, ...]) -> None:
     upright = run(*words, *PAYLOAD, "--vertical", "0 0 1")
-    np.testing.assert_allclose(gravity_of(upright)["mounting"], DOWN, atol=0.01)
+    # About the axis of the first joint, z, base and zero of that joint cannot be told apart.
+    np.testing.assert_allclose(gravity_of(upright)["mounting"], DOWN, atol=0.1)
+    assert abs(gravity_of(upright)["mounting"][2]) < 2e-3
     assert gravity_of(upright)["vertical"] is None
     assert gravity_of(upright)["payload"] == {"mass": 6.0, "xyz": [0.05, 0.0, 0.15]}
     stated = run(*words, *PAYLOAD, "--mounting", "0 -1 0")
     assert gravity_of(stated)["mounting"] == list(DOWN)
-    assert stated["left_out"]["rms"] == pytest.approx(upright["left_out"]["rms"], rel=0.05)
-    assert stated["left_out"]["rms"] < 1e-4
-    assert 0.7 < stated["left_out"]["predicted_rms"] / stated["left_out"]["rms"] < 1.4
+    assert upright["left_out"]["rms"] < 6e-5
+    assert 0.7 < upright["left_out"]["predicted_rms"] / upright["left_out"]["rms"] < 1.4
+    assert upright["left_out"]["rms"] <= stated["left_out"]["rms"] < 1e-4
     floor = run(*words, *PAYLOAD)
     assert floor["left_out"]["rms"] > 5.0 * stated["left_out"]["rms"]
 
@@ -95,8 +98,10 @@ def test_what_was_used_is_said(run: Run, words: tuple[str, ...], folder: Path) -
     instrument.write_text("type: laser_tracker\nstation: [4, 0, 1]\nup: [0, 0, 1]\n")
     assert "mounted on a wall" in told("--instrument", str(instrument))
     instrument.write_text("type: laser_tracker\nstation: [4, 0, 1]\n")
-    assert "if that is not so, give --mounting" in told("--instrument", str(instrument))
-    assert "none of a robot that is mounted under a ceiling" in told("--mounting", "ceiling")
+    assert "mounted on the floor" in told("--instrument", str(instrument))
+    assert "mounted under a ceiling" in told("--mounting", "ceiling")
+    nothing = gravity_note(None, Gravity(mounting=DOWN), Robot.load("ur10e"))
+    assert "none of a robot that is mounted on a wall; if that is not so, give --mounting" in nothing
 
 
 @pytest.mark.parametrize(
