@@ -3,12 +3,10 @@
     python bench/real_robot.py [--data ../shared/data] [--seeds 6] [--pool 600] [--random 100] [--json FILE]
 
 For every seed a random part of ``ur10_tracker/random_poses.csv`` is the pool; n of its rows are chosen, all
-placement errors with tracker and target are identified from them, and all other rows of the file are predicted.
-"Beats" is the share of random choices from the same pool with a larger mean (95th percentile) error. Two
-estimators, both Gauss–Newton on the full model with Gaussian priors (0.5 mm, 1 mrad) and mild robust weights
-(Student t with 4 degrees of freedom per point): ``joint`` weighs a point by the inverse of the discrepancy's
-Σ(q), ``flat`` gives every coordinate 0.4 mm. Measured points enter the choice only through the rough pose of
-tracker and target (every fifth row of the file), and through the discrepancy's defaults, found on this robot.
+placement errors with tracker and target are identified from them by the default estimator, with all
+terms, and all other rows of the file are predicted. "Beats" is the share of random choices from the same pool
+with a larger mean (95th percentile) error. Measured points enter the choice only through the rough pose of tracker
+and target (every fifth row of the file).
 """
 
 from __future__ import annotations
@@ -22,88 +20,57 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner import Robot
+from calib_planner import IdentificationProblem, Robot, identify
 from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.error_model import ErrorModel
 from calib_planner.identification import start_robot
 from calib_planner.io import read_measurements
 from calib_planner.measurements import Measurements
-from calib_planner.planning import Candidates, ModelDiscrepancy, PlanProblem, plan
+from calib_planner.planning import Candidates, PlanProblem, plan, usual_error_model
 from calib_planner.tracker import Isotropic
 
 COUNTS = (10, 15, 20, 30)
 SIGMA = 1.5e-5
-FLAT = 4e-4
-FREEDOM = 4.0
 ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """Least squares with priors and robust weights, on measured configurations.
+    """The estimator that is the default, on measured configurations.
 
     Attributes:
         robot: Nominal, tracker and target near their place, all parameters active.
         data: All rows.
-        whitener: (N, 3, 3) W^½ of each row.
-        prior_std: (P,) [m | rad].
     """
 
     robot: Robot
     data: Measurements
-    whitener: FloatArray
-    prior_std: FloatArray
-
-    def fit(self, rows: IntArray, outer: int = 2, inner: int = 6) -> FloatArray:
-        """Deviations (P,): Gauss–Newton outside, reweighting inside."""
-        deviations = np.zeros(len(self.prior_std))
-        weight = np.ones(len(rows))
-        for _ in range(outer):
-            points, jacobian = self.robot.positions_and_jacobian(self.data.q[rows], deviations)
-            white = self.whitener[rows]
-            design = white @ np.ascontiguousarray(jacobian) * self.prior_std
-            scaled = deviations / self.prior_std
-            right = (white @ (self.data.p[rows] - points)[:, 0, :, None])[:, :, 0] + design @ scaled
-            for _ in range(inner):
-                rooted = (design * np.sqrt(weight)[:, None, None]).reshape(-1, len(scaled))
-                target = (right * np.sqrt(weight)[:, None]).ravel()
-                scaled = np.linalg.solve(rooted.T @ rooted + np.eye(len(scaled)), rooted.T @ target)
-                squares = ((right - design @ scaled) ** 2).sum(axis=1)
-                weight = (FREEDOM + 3.0) / (FREEDOM + squares)
-            deviations = scaled * self.prior_std
-        return deviations
 
     def held_out(self, rows: IntArray) -> tuple[float, float]:
         """Mean and 95th percentile of the error at all other rows [mm]."""
         others = np.setdiff1d(np.arange(len(self.data)), rows)
-        difference = self.data.p[others] - self.robot.positions(self.data.q[others], self.fit(rows))
+        known = identify(IdentificationProblem(self.robot, self.data.select(rows))).knowledge
+        difference = self.data.p[others] - known.predict(self.data.q[others]).mean
         distance = 1e3 * np.linalg.norm(difference[:, 0], axis=1)
-        return float(distance.mean()), float(np.percentile(distance, 95))
+        return float(np.mean(distance)), float(np.percentile(distance, 95))
 
 
-def estimators(robot: Robot, data: Measurements, discrepancy: ModelDiscrepancy) -> dict[str, Estimator]:
-    """Both of them."""
-    joint = np.linalg.inv(np.linalg.cholesky(discrepancy.covariance(robot, data.q, Isotropic(SIGMA))))
-    flat = np.broadcast_to(np.eye(3) / FLAT, joint.shape)
-    std = discrepancy.prior_std(robot)
-    return {"joint": Estimator(robot, data, joint, std), "flat": Estimator(robot, data, flat, std)}
-
-
-def planners(robot: Robot, discrepancy: ModelDiscrepancy) -> dict[str, Callable[[FloatArray, int], FloatArray]]:
+def planners(robot: Robot) -> dict[str, Callable[[FloatArray, int], FloatArray]]:
     """Name → (pool, n) → configurations."""
 
     def ask(**options: Any) -> Callable[[FloatArray, int], FloatArray]:
         def choose(pool: FloatArray, n: int) -> FloatArray:
             poses = None if options.get("criterion") == "d" else pool
-            return plan(
-                PlanProblem(robot, poses, n, noise=SIGMA, **options, candidates=Candidates(pool))
-            ).configurations
+            problem = PlanProblem(robot, poses, n, noise=SIGMA, **options, candidates=Candidates(pool))
+            return plan(problem).configurations
 
         return choose
 
-    white = replace(discrepancy, joint_sigma=0.0, point_sigma=3e-4)
+    usual = usual_error_model(robot, SIGMA)
+    white = replace(ErrorModel.paper(Isotropic(3e-4)), placement=usual.placement, scales=usual.scales)
     return {
-        "discrepancy": ask(discrepancy=discrepancy),
-        "white 0.3 mm, priors": ask(discrepancy=white),
+        "typical": ask(error_model=usual),
+        "white 0.3 mm, priors": ask(error_model=white),
         "plain test poses": ask(),
         "plain D": ask(criterion="d"),
     }
@@ -174,8 +141,7 @@ def main() -> None:
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
     data = read_measurements(folder / "random_poses.csv", robot).data
     robot = start_robot(robot, data.select(np.arange(0, len(data), 5)))
-    discrepancy = ModelDiscrepancy()
-    judges, ways = estimators(robot, data, discrepancy), planners(robot, discrepancy)
+    judges, ways = {"default": Estimator(robot, data)}, planners(robot)
     entries = []
     for seed in range(args.seeds):
         entries += one_seed(seed, data, judges, ways, args.pool, args.random)

@@ -219,6 +219,28 @@ class PlanSpace:
         return Accuracy((1.0 - share) * plain.weight + share * self.general)
 
 
+SPREAD = 4.0
+"""Factor by which the robot's errors may differ from typical ones: one standard deviation of their scales."""
+UNCERTAIN = ("gravity", "smooth.size", "short.size", "repeatability")
+"""Scales that a plan does not trust until an estimate has taught them."""
+
+
+def spread_spaces(problem: PlanProblem) -> tuple[PlanSpace, ...]:
+    """The problem for a robot that errs less, and for one that errs more, than the typical one.
+
+    A sum of concave criteria is concave: a plan that is good in the mean over the three is found as any other.
+    Nothing for other models: their scales are taught or stated.
+    """
+    model = problem.whole_model
+    if model is None or model.name != "typical":
+        return ()
+    spaces = []
+    for factor in (1.0 / SPREAD, SPREAD):
+        values = {name: value * factor for name, value in model.values.items() if name in UNCERTAIN}
+        spaces.append(plan_space(replace(problem, error_model=model.with_values(values, name="spread"))))
+    return tuple(spaces)
+
+
 def plan_space(problem: PlanProblem) -> PlanSpace:
     """Prepare a problem.
 

@@ -20,7 +20,7 @@ from calib_planner.planning.bound import ApproximateDesign, DesignProblem, appro
 from calib_planner.planning.certify.prove import Proof, prove_bound
 from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
 from calib_planner.planning.extended import ExtendedModel
-from calib_planner.planning.information import PlanSpace, plan_space
+from calib_planner.planning.information import PlanSpace, plan_space, spread_spaces
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
@@ -188,14 +188,21 @@ def _search(
 ) -> SearchResult:
     """Parts of the work, here or by the executor, until enough is known; the best, the first one if equal."""
     nobody = np.empty((0, len(space.robot.joint_names)))
-    search = SearchProblem(
-        model=space.model,
-        criterion=criterion,
-        prior=space.prior,
-        size=space.problem.configurations,
-        feasibility=space.feasibility,
-        support=design.support if design else nobody,
-        weights=design.weights if design else np.empty(0),
+
+    def searched(space: PlanSpace, criterion: Criterion) -> SearchProblem:
+        return SearchProblem(
+            model=space.model,
+            criterion=criterion,
+            prior=space.prior,
+            size=space.problem.configurations,
+            feasibility=space.feasibility,
+            support=design.support if design else nobody,
+            weights=design.weights if design else np.empty(0),
+        )
+
+    search = replace(
+        searched(space, criterion),
+        beside=tuple(searched(other, _criterion_of(other, criterion)) for other in spread_spaces(space.problem)),
     )
     sizes = parts(space.problem.starts)
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
@@ -211,7 +218,9 @@ def _search(
         done, evaluations = done + result.starts, evaluations + result.evaluations
         if best is None or result.log_value > best.log_value:
             best = result
-        clock.tell(done, best.log_value)
+        # With other sizes of the errors beside them, ``log_value`` is a mean over all of them.
+        psi = _psi_of(space, criterion, best.configurations) if search.beside else np.exp(best.log_value)
+        clock.tell(done, float(np.log(max(psi, 1e-300))))
     for future in futures:
         future.cancel()
     assert best is not None
@@ -242,22 +251,36 @@ def _choose(
     problem = space.problem
     candidates = np.asarray(problem.candidate_array)
     allowed = np.flatnonzero(space.feasibility.mask(candidates))
-    together = None
-    if isinstance(space.model, ExtendedModel):
-        together = space.model.linearised(candidates[allowed])
-    request = ChoiceProblem(
-        rows=space.model.whitened(candidates[allowed]),
+    request = _choice(space, criterion, candidates[allowed], design)
+    if request.together is not None:
+        others = spread_spaces(problem)
+        beside = (_choice(s, _criterion_of(s, criterion), candidates[allowed], design) for s in others)
+        request = replace(request, beside=tuple(beside))
+    chosen = choose(request, rng, clock.over)
+    clock.tell(problem.starts, chosen.log_value)
+    return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
+
+
+def _choice(
+    space: PlanSpace, criterion: Criterion, candidates: FloatArray, design: ApproximateDesign | None
+) -> ChoiceProblem:
+    """The choice among ``candidates`` (C, joints), all of them feasible."""
+    together = space.model.linearised(candidates) if isinstance(space.model, ExtendedModel) else None
+    return ChoiceProblem(
+        rows=space.model.whitened(candidates),
         criterion=criterion,
         prior=space.prior,
-        size=problem.configurations,
-        repeat=not problem.once_each,
+        size=space.problem.configurations,
+        repeat=not space.problem.once_each,
         weights=design.weights if design else np.empty(0),
         names=space.robot.parameter_names if together is None else (),
         together=together,
     )
-    chosen = choose(request, rng, clock.over)
-    clock.tell(problem.starts, chosen.log_value)
-    return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
+
+
+def _criterion_of(space: PlanSpace, criterion: Criterion) -> Criterion:
+    """The criterion of the search in another space of the same problem."""
+    return space.search_criterion() if not space.problem.compound else criterion
 
 
 # ── the answer ───────────────────────────────────────────────────────────────────────────────────────

@@ -25,6 +25,7 @@ from calib_planner.measurements import Measurements
 from calib_planner.planning import Candidates, PlanPrior, Search, plan_space, with_wide_placement
 from calib_planner.planning.bound import approximate_design
 from calib_planner.planning.extended import ExtendedModel
+from calib_planner.planning.information import spread_spaces
 from calib_planner.planning.planner import _design_problem, value_of
 from calib_planner.planning.search.exchange import ChoiceProblem, _information, choose
 from calib_planner.tracker import Isotropic, LaserTracker
@@ -221,3 +222,19 @@ def test_flat_parameters_need_as_many_configurations_as_before() -> None:
     scales = tuple(s for s in model.scales if not s.name.startswith("placement."))
     with pytest.raises(InfeasibleError, match="at least 3"):
         plan(PlanProblem(kuka(), POSE, 2, error_model=replace(model, scales=scales)))
+
+
+def test_a_plan_for_a_typical_robot_does_not_trust_one_size_of_its_errors() -> None:
+    """It is better in the mean over smaller and larger errors than the plan that trusts the median alone."""
+    given = typical(Isotropic(3e-5))
+    worth = {}
+    for name in ("typical", "taught"):
+        problem = PlanProblem(kuka(), POSE, 6, error_model=replace(given, name=name), search=FEW)
+        space, q = plan_space(problem), plan(problem).configurations
+        spaces = (space, *spread_spaces(replace(problem, error_model=given)))
+        assert len(spaces) == 3 and len(spread_spaces(problem)) == (2 if name == "typical" else 0)
+        matrices = [s.model.totals(q, len(q))[0] + s.prior for s in spaces]
+        worth[name] = np.mean(
+            [np.log(s.search_criterion().exact(m)) for s, m in zip(spaces, matrices, strict=True)]
+        )
+    assert worth["typical"] > worth["taught"] - 1e-4

@@ -29,7 +29,7 @@ and a trial takes what the candidate adds to the other rows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -152,6 +152,8 @@ class ChoiceProblem:
         weights: (C,) weights of the approximate design, to start from, or empty.
         names: p names of the parameters, for messages.
         together: The candidates where they share errors, else ``None``; ``rows`` is then each of them alone.
+        beside: The same problem for other sizes of the robot's errors, where candidates share errors: the choice
+            is improved for the mean of log Ψ over all of them.
     """
 
     rows: FloatArray
@@ -162,6 +164,7 @@ class ChoiceProblem:
     weights: FloatArray = field(default_factory=lambda: np.empty(0))
     names: tuple[str, ...] = ()
     together: LinearisedExtension | None = None
+    beside: tuple[ChoiceProblem, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +197,7 @@ def choose(
     for start in _starts(problem, rng):
         count += 1
         rows, tried = search.run(start, cancel)
-        log_value = float(_log_values(problem, _information(problem, rows)[None])[0])
+        log_value = _mean_log_value(problem, rows)
         evaluations += tried
         if best is None or log_value > best.log_value:
             best = Choice(rows, log_value, 0)
@@ -248,6 +251,12 @@ def _information(problem: ChoiceProblem, rows: IntArray) -> FloatArray:
         return problem.prior + problem.together.rows(rows).sums(len(rows))[0]
     own = problem.rows[rows].reshape(-1, problem.rows.shape[2])
     return problem.prior + own.T @ own
+
+
+def _mean_log_value(problem: ChoiceProblem, rows: IntArray) -> float:
+    """log Ψ of a choice, the mean over the problem and those beside it."""
+    every = (problem, *problem.beside)
+    return float(np.mean([_log_values(p, _information(p, rows)[None])[0] for p in every]))
 
 
 def _log_values(problem: ChoiceProblem, matrices: FloatArray) -> FloatArray:
@@ -393,25 +402,31 @@ class _Together:
         self.average = flat.T @ flat / len(problem.rows)
 
     def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
-        problem, rows = self.problem, self._greedy(start)
-        log_value = float(_log_values(problem, _information(problem, rows)[None])[0])
-        tried = 1
+        rows = self._greedy(start)
+        tried = self._exchange(rows, replace(self.problem, beside=()), cancel)
+        if self.problem.beside:
+            tried += self._exchange(rows, self.problem, cancel)
+        return rows, tried
+
+    def _exchange(self, rows: IntArray, problem: ChoiceProblem, cancel: Callable[[], bool]) -> int:
+        """Exchange ``rows`` in place until that pays no more; returns the number of exchanges tried."""
+        log_value, tried = _mean_log_value(problem, rows), 1
         for _ in range(MOST_PASSES):
             improved = False
             for position in range(problem.size):
                 if cancel():
-                    return rows, tried
+                    return tried
                 shortlist = self._best(self._seen(rows), rows)
                 others = np.delete(rows, position)
-                added = self.info.rows(shortlist).given(self.info.rows(others))
-                trial = _log_values(problem, _information(problem, others) + np.swapaxes(added, 1, 2) @ added)
+                every = (problem, *problem.beside)
+                trial = np.mean([_with_one_more(p, others, shortlist) for p in every], axis=0)
                 tried += len(shortlist)
                 best = int(np.argmax(trial)) if len(trial) else 0
                 if len(trial) and trial[best] > log_value + 1e-6:
                     rows[position], log_value, improved = shortlist[best], float(trial[best]), True
             if not improved:
                 break
-        return rows, tried
+        return tried
 
     def _greedy(self, start: IntArray) -> IntArray:
         """Fill up with the candidate of largest first-order gain, from a little of the candidates' mean."""
@@ -440,3 +455,10 @@ class _Together:
             gains[taken] = -np.inf
         order = np.argsort(-gains, kind="stable")[:SHORTLIST]
         return order[np.isfinite(gains[order])]
+
+
+def _with_one_more(problem: ChoiceProblem, others: IntArray, new: IntArray) -> FloatArray:
+    """log Ψ of the rows ``others`` with each of ``new`` (K,): (K,)."""
+    assert problem.together is not None
+    added = problem.together.rows(new).given(problem.together.rows(others))
+    return _log_values(problem, _information(problem, others) + np.swapaxes(added, 1, 2) @ added)

@@ -60,6 +60,8 @@ class SearchProblem:
         feasibility: What they have to obey besides the joint limits.
         support: (K, joints) configurations of the approximate design; K may be 0.
         weights: (K,) their weights.
+        beside: The same problem for other sizes of the robot's errors: the best plan of every part is improved
+            for the mean of log Ψ over all of them.
     """
 
     model: Model
@@ -69,6 +71,7 @@ class SearchProblem:
     feasibility: Feasibility
     support: FloatArray
     weights: FloatArray
+    beside: tuple[SearchProblem, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +100,18 @@ def plan_objective(problem: SearchProblem, size: int) -> Objective:
     return objective
 
 
+def mean_objective(problem: SearchProblem, size: int) -> Objective:
+    """The mean of ``plan_objective`` over the problem and those beside it."""
+    every = [plan_objective(p, size) for p in (problem, *problem.beside)]
+
+    def objective(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        parts = [part(rows) for part in every]
+        values, gradients = zip(*parts, strict=True)
+        return np.mean(values, axis=0), np.mean(gradients, axis=0)
+
+    return objective
+
+
 def search_chunk(
     problem: SearchProblem,
     starts: int,
@@ -109,7 +124,10 @@ def search_chunk(
     extended = isinstance(problem.model, ExtendedModel)
     rough = _descend_from(problem, size, rows, cancel, *(EXTENDED_ROUGH if extended else (80, 1e-4)))
     finalists = rough.x[np.argsort(rough.value)[: 1 if extended else FINALISTS]]
-    final = _descend_from(problem, size, finalists, cancel, *(EXTENDED_FINAL if extended else (200, 1e-7)))
+    last = mean_objective(problem, size) if problem.beside else None
+    final = _descend_from(
+        problem, size, finalists, cancel, *(EXTENDED_FINAL if extended else (200, 1e-7)), objective=last
+    )
     work = used + rough.evaluations + final.evaluations
     if problem.feasibility.constraints and isinstance(problem.model, InformationModel):
         final, more = _along_the_edge(problem, problem.model, final, rng, cancel)
@@ -186,13 +204,15 @@ def _descend_from(
     cancel: Callable[[], bool],
     iterations: int,
     tolerance: float,
+    objective: Objective | None = None,
 ) -> Descent:
     low, high = problem.model.robot.joint_limits.T
     flat = rows.reshape(len(rows), -1)
+    objective = plan_objective(problem, size) if objective is None else objective
     beside = max(BATCH // flat.shape[1] ** 2, 1)
     ended = [
         descend(
-            plan_objective(problem, size),
+            objective,
             flat[first : first + beside],
             np.tile(low, size),
             np.tile(high, size),
