@@ -5,8 +5,8 @@
 For every seed a random part of ``ur10_tracker/random_poses.csv`` is the pool; n of its rows are chosen, all
 placement errors with tracker and target are identified from them by the default estimator, with all
 terms, and all other rows of the file are predicted. "Beats" is the share of random choices from the same pool
-with a larger mean (95th percentile) error. Measured points enter the choice only through the rough pose of tracker
-and target (every fifth row of the file).
+with a larger mean (95th percentile) error. Measured points enter the choice only through the rough pose of
+tracker and target (every fifth row of the file).
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class Estimator:
         """Mean and 95th percentile of the error at all other rows [mm]."""
         others = np.setdiff1d(np.arange(len(self.data)), rows)
         known = identify(IdentificationProblem(self.robot, self.data.select(rows))).knowledge
-        difference = self.data.p[others] - known.predict(self.data.q[others]).mean
+        difference: FloatArray = self.data.p[others] - known.predict(self.data.q[others]).mean
         distance = 1e3 * np.linalg.norm(difference[:, 0], axis=1)
-        return float(np.mean(distance)), float(np.percentile(distance, 95))
+        return float(np.mean(np.asarray(distance, float))), float(np.percentile(distance, 95))
 
 
 def planners(robot: Robot) -> dict[str, Callable[[FloatArray, int], FloatArray]]:
@@ -91,7 +91,7 @@ def one_seed(
             for name, rows in chosen.items():
                 got = np.array(estimator.held_out(rows))
                 beats = 100.0 * (random > got).mean(axis=0)
-                entry = {"seed": seed, "n": n, "estimator": judge, "plan": name}
+                entry: dict[str, Any] = {"seed": seed, "n": n, "estimator": judge, "plan": name}
                 entry |= {"mean_mm": got[0], "p95_mm": got[1], "beats_mean": beats[0], "beats_p95": beats[1]}
                 entry |= {"random_mean_mm": np.median(random[:, 0]), "random_p95_mm": np.median(random[:, 1])}
                 result.append({k: v if isinstance(v, (str, int)) else float(v) for k, v in entry.items()})
