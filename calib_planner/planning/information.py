@@ -228,7 +228,7 @@ UNCERTAIN = ("gravity", "smooth.size", "short.size", "repeatability")
 def spread_spaces(problem: PlanProblem) -> tuple[PlanSpace, ...]:
     """The problem for a robot that errs less, and for one that errs more, than the typical one.
 
-    A sum of concave criteria is concave: the search for a plan that is good in the mean over the three is as before.
+    A sum of concave criteria is concave: the search for a plan that is good in the mean of them is as before.
     Nothing for other models: their scales are taught or stated.
     """
     model = problem.whole_model
