@@ -91,6 +91,13 @@ class Assessment:
         return Isotropic(self.estimate.noise.sigma)
 
     @property
+    def model(self) -> ErrorModel:
+        """All terms that were asked for, with the sizes that are known by now and the noise as estimated."""
+        asked, now = self.problem.model, self.estimate.knowledge.model
+        values = {n: v for n, v in now.values.items() if n in asked.values}
+        return replace(asked.with_values(values), points=now.points)
+
+    @property
     def used(self) -> Measurements:
         """The measurements that were not rejected."""
         data = self.problem.data.without(self.estimate.points.rejected)
@@ -111,27 +118,32 @@ def assess(state: CampaignState) -> Assessment | None:
     return Assessment(problem, identify(problem))
 
 
+def expected(problem: CampaignProblem) -> ErrorModel:
+    """How robot and measurement err before anything is measured; the noise is an expectation."""
+    model, prior = problem.identification.get("error_model"), problem.identification.get("prior")
+    model = typical() if model is None else model
+    if not model.is_papers and not model.points.estimate_scale:
+        factor = next(s for s in typical(estimate_scale=True).scales if s.name == "instrument")
+        points = replace(model.points, estimate_scale=True)
+        model = replace(model, points=points, scales=(*model.scales, factor))
+    if prior is not None:
+        model = replace(model, placement=replace(model.placement, stated=prior))
+    return model.with_noise(problem.instrument)
+
+
 def identification_problem(problem: CampaignProblem, data: Measurements) -> IdentificationProblem:
     """What is identified from ``data``; their own standard deviations go before the instrument's."""
-    options = dict(problem.identification)
-    model = options.pop("error_model", None)
+    model = expected(problem)
+    if data.std is not None and not model.is_papers:
+        model = replace(model, points=replace(model.points, noise=None))
     return IdentificationProblem(
         problem.robot,
         data,
-        error_model=_with_expected_noise(typical() if model is None else model),
-        instrument=None if data.std is not None else problem.instrument,
+        error_model=model,
+        loss=problem.identification.get("loss", "auto"),
         test_poses=problem.test_pose_array,
         accuracy_frame=problem.accuracy_frame,
-        **options,
     )
-
-
-def _with_expected_noise(model: ErrorModel) -> ErrorModel:
-    """The model in which the stated noise may be wrong by a factor; the paper's stays."""
-    if model.is_papers or model.points.estimate_scale:
-        return model
-    factor = next(s for s in typical(estimate_scale=True).scales if s.name == "instrument")
-    return replace(model, points=replace(model.points, estimate_scale=True), scales=(*model.scales, factor))
 
 
 # ── Is it enough to judge by, enough altogether, or never enough? ────────────────────────────────────────────

@@ -10,8 +10,9 @@ For the fit, in this order:
 3. No measurement is left but those of the validation: **budget_spent**.
 4. The robot's repeatability is surely more than required at a test pose even if nothing else were uncertain:
    **limited**. More measurements cannot help.
-5. Else the next batch is planned on the robot as identified so far, with the noise as estimated and all that was
-   measured.
+5. Else the next batch is planned on the robot as identified so far, with the sizes of its errors and the noise
+   as estimated and all that was measured. A term that the estimate left out, because nothing told of it so far,
+   is in the plan: it may be measured next.
 
 Then the validation. Good plans measure at few places, where a wrong model fits well enough; configurations that
 were chosen to lie elsewhere contradict it best. If they do (see ``finish``) although the accuracy seemed to be
@@ -39,6 +40,7 @@ from calib_planner.campaign.assess import (
     Assessment,
     assess,
     different,
+    expected,
     forecast,
     outcome_of,
     ready,
@@ -117,17 +119,16 @@ def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable
 def plan_problem(state: CampaignState, known: Assessment | None) -> PlanProblem:
     """The plan problem of the next batch, but for the number of configurations."""
     problem = state.problem
-    prior = problem.identification.get("prior")
-    std = {} if prior is None else dict(zip(prior.names, np.sqrt(np.diag(prior.covariance)), strict=True))
     poses = problem.test_pose_array
     return PlanProblem(
         problem.robot if known is None else known.estimate.calibrated,
         poses,
         1,
-        noise=problem.instrument if known is None else known.noise,
+        error_model=expected(problem) if known is None else known.model,
+        accuracy_frame=problem.accuracy_frame,
         criterion="test_pose" if len(poses) == 1 else "worst_pose",
         constraints=state.constraints,
-        prior=PlanPrior(std=std, measured=None if known is None else known.used),
+        prior=PlanPrior(measured=None if known is None else known.used),
         search=Search(
             starts=problem.starts, seed=problem.seed + len(state.rounds), time_limit=problem.time_limit
         ),

@@ -25,11 +25,13 @@ that, J⁺ C J⁺ᵀ − J (M_ΠΠ)⁻¹ Jᵀ; *repeatability*, of the visit; an
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
 
 from calib_planner.arrays import FloatArray, check_configurations
 from calib_planner.error_model.gravity import PAYLOAD, Payload
@@ -213,6 +215,10 @@ class Knowledge:
         scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
         rest = self.covariance[count:, count:] * np.outer(scale, scale)
         scaled = cross * scale
+        with suppress(np.linalg.LinAlgError):  # a coefficient that is known has a row of zeros
+            root = np.linalg.cholesky(rest + ROUNDING * np.eye(len(rest)))
+            white = solve_triangular(root, scaled.T, lower=True)
+            return np.asarray(own - white.T @ white)
         return own - scaled @ np.linalg.pinv(rest, rcond=1e-12, hermitian=True) @ scaled.T
 
     # ── accuracy ─────────────────────────────────────────────────────────────────────────────────────

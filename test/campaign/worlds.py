@@ -30,13 +30,13 @@ def world_of(
 
 
 def kuka(required: float = 15e-6, seed: int = 0, **changes: object) -> CampaignProblem:
-    values = {"robot": Robot.load("kuka_kr270"), "test_poses": POSE, "starts": 4, "seed": seed}
+    values = {"robot": Robot.load("kuka_kr270"), "test_poses": POSE, "starts": 2, "seed": seed}
     values |= {"identification": PAPER, **changes}
     return CampaignProblem(required_accuracy=required, sigma=SIGMA, **values)  # type: ignore[arg-type]
 
 
 def planar(required: float = 12e-6, seed: int = 0, **changes: object) -> CampaignProblem:
-    values = {"robot": Robot.load("planar_2r"), "test_poses": np.radians([10.0, 50.0]), "starts": 4, "seed": seed}
+    values = {"robot": Robot.load("planar_2r"), "test_poses": np.radians([10.0, 50.0]), "starts": 2, "seed": seed}
     values |= {"identification": PAPER, **changes}
     return CampaignProblem(required_accuracy=required, sigma=SIGMA, **values)  # type: ignore[arg-type]
 

@@ -16,7 +16,7 @@ from calib_planner.measurements import Measurements
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 POSE = ["--test-pose", "0.17453 0.87266"]
-SEARCH = ["--starts", "4"]
+SEARCH = ["--starts", "2"]
 BASE = ["campaign", "--robot", "planar_2r", *POSE, "--required-accuracy", "120e-6", *SEARCH]
 KEYS = {"outcome", "message", "rounds", "verdict", "estimate", "measurements", "validation_measurements", "spent"}
 
