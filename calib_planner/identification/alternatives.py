@@ -1126,7 +1126,8 @@ class _Gross:
             return self._elsewhere(self._fitted(plain, self.q, self.p, FIT_ROUNDS, True))
         base, after = self._units(plain, before)
         limit = SOUND * self._extent(base.q)
-        before = replace(before, level=before.level / base.metre)
+        # What could not be placed at all leaves as much as the points spread.
+        before = replace(before, level=min(before.level, _spread(self.p)) / base.metre)
         if base is not plain and after.level < min(limit, before.level / CLEAR):
             return self._told([base], before, after)
         several, after = self._best(base, after)
@@ -1433,7 +1434,7 @@ class _Gross:
         if units is not None:
             text, advice = f"{units.words['size']}, and {text}", f"{units.words['advice']}, and {advice}"
         ratio = before.level / max(after.level, 1e-12)
-        nats = after.spare * float(np.log(ratio)) if np.isfinite(ratio) else np.inf
+        nats = after.spare * float(np.log(ratio))
         return replace(
             told,
             text=text,

@@ -328,6 +328,7 @@ def test_a_gross_mistake_is_named(mistake: str, name: str) -> None:
     wanted = {k: names[v] if k in ("joint", "beside") else v for k, v in expected.items()}
     assert {k: getattr(told, k) for k in wanted} == wanted, told.text
     assert told.material and told.probability < SIGNIFICANT
+    json.dumps(asdict(told), allow_nan=False)
 
 
 def test_exchanged_targets_are_named_where_their_places_are_known() -> None:
