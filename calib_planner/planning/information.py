@@ -400,7 +400,12 @@ def _needed(jacobians: FloatArray, prior: FloatArray) -> tuple[int, int, int]:
 
 
 def smallest_size(problem: PlanProblem) -> int:
-    """The smallest number of configurations that could identify the problem's parameters, at least 1."""
+    """The smallest number of configurations that could identify the problem's parameters, at least 1.
+
+    With a whole error model the tolerances of the chain do not count as known: a plan that relies on them shows
+    the test poses alone.
+    """
     space = plan_space(replace(problem, configurations=len(problem.robot.parameter_names)))
-    q = _representative(problem, space.feasibility)[:8]
-    return max(_needed(np.ascontiguousarray(space.robot.jacobian(q)), space.prior)[0], 1)
+    q, count = _representative(problem, space.feasibility)[:8], len(space.robot.parameter_names)
+    known = np.zeros((count, count)) if problem.whole_model else space.prior
+    return max(_needed(np.ascontiguousarray(space.robot.jacobian(q)), known)[0], 1)

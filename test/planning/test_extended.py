@@ -22,7 +22,15 @@ from calib_planner.error_model import (
 )
 from calib_planner.error_model.knowledge import information, prior_information
 from calib_planner.measurements import Measurements
-from calib_planner.planning import Candidates, PlanPrior, Search, plan_space, with_wide_placement
+from calib_planner.planning import (
+    Candidates,
+    PlanPrior,
+    Search,
+    plan_for_accuracy,
+    plan_space,
+    smallest_size,
+    with_wide_placement,
+)
 from calib_planner.planning.bound import approximate_design
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import spread_spaces
@@ -238,3 +246,13 @@ def test_a_plan_for_a_typical_robot_does_not_trust_one_size_of_its_errors() -> N
             [np.log(s.search_criterion().exact(m)) for s, m in zip(spaces, matrices, strict=True)]
         )
     assert worth["typical"] > worth["taught"] - 1e-4
+
+
+def test_an_accuracy_is_reached_by_as_many_configurations_as_there_is_to_identify() -> None:
+    """One visit to the test pose would do, and would tell nothing of the robot."""
+    problem = PlanProblem(
+        kuka(), POSE, 1, error_model=replace(typical(Isotropic(3e-5)), name="taught"), search=FEW
+    )
+    assert smallest_size(problem) == smallest_size(replace(problem, error_model=None)) == 3
+    split = plan_for_accuracy(problem, 4e-4)
+    assert len(split.plan.configurations) == 3 and split.fewest == 0
