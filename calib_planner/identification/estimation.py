@@ -1,14 +1,14 @@
 """Identification with one error model: from measurements to parameters, coefficients and scales.
 
     1. start      Base and targets, where they are unknown, in closed form (``registration``), then generalised
-                  least squares at typical scales until the predictions stand still.
+                  least squares at typical scales and wide tolerances until the predictions stand still.
     2. scales     Linearise at the current values, (M1); the scales maximise the restricted likelihood times their
                   priors (``likelihood``); generalised least squares gives parameters and coefficients. Repeat.
     3. doubt      Where points or a run of visits are impossible beside the others, these lose their weight
                   (``doubt``).
     4. terms      A term that does not better the left-out score goes (``left_out``).
-    5. all        Many points: 1 to 4 are done with some of the visits; generalised least squares at the scales
-                  chosen is done with all of them.
+    5. all        Many points: 1 to 4 are done with some of the visits; all of them then better the scales, and
+                  generalised least squares is done with all.
 
 The paper's model has no scales and no terms to choose: what is left are its steps (6) and (7), and (11).
 
@@ -58,6 +58,8 @@ from calib_planner.tracker import Isotropic
 
 MOST_STARTS = 20
 """Most relinearisations at typical scales."""
+WIDE = 10.0
+"""Times the tolerances of the error model that lengths and angles have at the start."""
 MOST_ROUNDS = 6
 """Most relinearisations with new scales."""
 STUDENT_ROUNDS = 12
@@ -66,7 +68,7 @@ CAUCHY_ROUNDS = 30
 """Most rounds of weights that place tracker and targets."""
 FAR = 30.0
 """Points this many medians away are doubted from the start."""
-BENT = 1e-3
+BENT = 1e-4
 """Predictions that move by more than this are looked at before the step is taken [m]."""
 SWELLS = 10.0
 """Scales of visits and points this many times their median are taken for gross errors until that is disproved."""
@@ -90,7 +92,7 @@ OFF = 1.25
 """Squared left-out residuals, over what is predicted, that change by this factor show that the scales are off."""
 BASE_ELEMENTS = 9
 """The first elements of a robot place its base (``Robot.with_base``)."""
-BENDS = 1e-2
+BENDS = 3e-2
 """Share of a point's standard deviation that kinematics and linearisation may differ by: it is not seen."""
 OPTIONAL = ("short", "smooth", "gravity")
 """Terms that have to better the left-out score."""
@@ -252,6 +254,14 @@ class _Work:
         allowed = BENDS * np.sqrt(np.diagonal(usual, axis1=1, axis2=2)) + LEAST
         return bool((np.abs(straight - apart.reshape(straight.shape)) > allowed).any())
 
+    def start(self, model: ErrorModel) -> None:
+        """Relinearise at the scales of ``model``, but with wide tolerances: a narrow prior that fights the data
+        makes the way there so crooked that no step along a line gets far."""
+        wide = {s.name: WIDE * s.value for s in model.scales if s.name in model.placement.scales}
+        self.state = replace(self.state, model=model.with_values(wide))
+        self.settle(MOST_STARTS, 0)
+        self.state = replace(self.state, model=model)
+
     def settle(self, most: int, scales: int = 30) -> Solution:
         """Relinearise until the predictions stand still; ``scales``: rounds for the scales each time."""
         self.moved = 0.0
@@ -273,7 +283,7 @@ class _Work:
         if many_are_wrong(solution, self.state.doubt) or self.swollen():
             model = self.state.model.with_values({s.name: s.median for s in self.state.model.scales})
             self.state = _State(np.zeros(len(self.state.coefficients)), model, np.maximum(squares, self.shifted))
-            self.settle(MOST_STARTS, 0)
+            self.start(model)
             for _ in range(STUDENT_ROUNDS):
                 solution = self.settle(1, 3)
                 old = self.state.doubt
@@ -390,7 +400,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
     work = _Work(robot, part, model)
     if robust:
         work.state = replace(work.state, doubt=far if some is None else far[some])
-    work.settle(MOST_STARTS, 0)
+    work.start(model)
     solution = work.settle(MOST_ROUNDS)
     if robust:
         solution = work.doubt(solution, squares if some is None else squares[some])
@@ -400,7 +410,6 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
         solution = work.settle(2)
     if work.state.model.scales:
         solution = work.settle(MOST_ROUNDS, 0)
-    scales = scale_covariance(solution)
     if some is not None:
         whole = _Work(robot, data, work.state.model)
         near = np.clip(np.searchsorted(some, np.arange(len(data))), 0, len(some) - 1)
@@ -408,10 +417,13 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
         doubt = np.maximum(far, whole.shifted) if robust else np.zeros(data.seen.shape)
         doubt[some] = work.state.doubt
         whole.state, whole.rounds = replace(work.state, doubt=doubt), work.rounds
+        # The scales of some visits are a start for those of all.
+        whole.settle(1, 2)
         solution = whole.settle(2, 0)
         if robust:
             solution = whole.reconsider(solution, 2, 0)
         work = whole
+    scales = scale_covariance(solution)
     covariance = _covariance(solution, scales)
     left = left_out(solution, work.groups)
     return ModelEstimate(
@@ -565,7 +577,7 @@ def _updated(
     work.rounds, work.converged = 1, True
     final: Solution = solution
     if work.bends(solution):
-        final = work.settle(2, 0)
+        final = work.settle(4, 0)
         work.rounds += 1
     left = left_out(final, work.groups)
     surprise = _surprise(left)

@@ -39,7 +39,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dpotri, dtrtri
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import ErrorModel
@@ -199,7 +199,6 @@ class Solution:
         value: −2 log L of (2) or (3), constants left out.
         coefficients: (coefficients,) γ̂ as Z γ̂, and û − ū; flat ones are changes from where it was linearised.
         weighted: (N, m) P y [1/m].
-        blocks: (N, m, m) P_ii [1/m²].
         squares: (K,) λ_k b_kᵀ P b_k.
         pulls: (K,) λ_k^½ b_kᵀ P y.
     """
@@ -208,9 +207,13 @@ class Solution:
     value: float
     coefficients: FloatArray
     weighted: FloatArray
-    blocks: FloatArray
     squares: FloatArray
     pulls: FloatArray
+
+    @cached_property
+    def blocks(self) -> FloatArray:
+        """(N, m, m) P_ii [1/m²]; many solutions are never asked for them."""
+        raise NotImplementedError
 
     def project(self, vectors: FloatArray) -> FloatArray:
         """P · vectors, (N·m, n) → (N·m, n)."""
@@ -245,6 +248,11 @@ class DenseSolution(Solution):
     projection: FloatArray
     spread: FloatArray
     carried: FloatArray
+
+    @cached_property
+    def blocks(self) -> FloatArray:
+        (n, m), every = self.problem.y.shape, np.arange(len(self.problem.y))
+        return self.projection.reshape(n, m, n, m)[every, :, every, :]
 
     def project(self, vectors: FloatArray) -> FloatArray:
         return self.projection @ vectors
@@ -288,6 +296,13 @@ class CoefficientSolution(Solution):
     white: FloatArray
     half: FloatArray
 
+    @cached_property
+    def blocks(self) -> FloatArray:
+        n, m = self.problem.y.shape
+        share = (self.white @ self.half).reshape(n, m, -1)
+        inner = np.eye(m) - share @ share.transpose(0, 2, 1)
+        return np.asarray(self.inverse.transpose(0, 2, 1) @ inner @ self.inverse)
+
     def project(self, vectors: FloatArray) -> FloatArray:
         turned = self._times(self.inverse, vectors)
         turned = turned - self.white @ (self.half @ (self.half.T @ (self.white.T @ turned)))
@@ -324,6 +339,10 @@ class UpdatedSolution(Solution):
     inverse: FloatArray
     log_determinant: float
     spread: FloatArray
+
+    @cached_property
+    def blocks(self) -> FloatArray:
+        return np.asarray(self.precision - self.precision @ self.spread @ self.precision)
 
     def project(self, vectors: FloatArray) -> FloatArray:
         turned = self._times(vectors)
@@ -373,7 +392,6 @@ def dense(problem: LinearProblem) -> DenseSolution:
         float(value),
         problem.expand(np.append(spread @ (carried.T @ y), pulls)),
         pulled.reshape(n, m),
-        projection.reshape(n, m, n, m)[every, :, every, :],
         np.einsum("ak,ak->k", scaled, projection @ scaled),
         pulls,
         projection,
@@ -388,26 +406,26 @@ def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
     rank = problem.flat_columns.shape[1]
     lower = np.linalg.cholesky(problem.covariance)
     inverse = np.linalg.inv(lower)
-    columns = np.hstack([problem.flat_columns, problem.scaled_columns])
-    white = (inverse @ columns.reshape(n, m, -1)).reshape(n * m, -1)
+    columns = np.empty((n, m, rank + len(problem.random)))
+    np.matmul(inverse, problem.flat_columns.reshape(n, m, -1), out=columns[:, :, :rank])
+    np.matmul(inverse, problem.scaled_columns.reshape(n, m, -1), out=columns[:, :, rank:])
+    white = columns.reshape(n * m, -1)
     right = (inverse @ problem.y[:, :, None]).ravel()
     normal = white.T @ white
     normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
     scale = 1.0 / np.sqrt(np.diag(normal))
     factor = np.linalg.cholesky(normal * np.outer(scale, scale))
-    half = scale[:, None] * np.linalg.inv(factor).T
+    half = scale[:, None] * np.asarray(dtrtri(factor, lower=1)[0]).T
     solution = half @ (half.T @ (white.T @ right))
     rest = right - white @ solution
     value = 2.0 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum()
     value += 2.0 * (np.log(np.diag(factor)) - np.log(scale)).sum() + right @ rest
-    share = (white @ half).reshape(n, m, -1)
     transposed = inverse.transpose(0, 2, 1)
     return CoefficientSolution(
         problem,
         float(value),
         problem.expand(solution),
         (transposed @ rest.reshape(n, m, 1))[:, :, 0],
-        transposed @ (np.eye(m) - share @ share.transpose(0, 2, 1)) @ inverse,
         1.0 - np.sum(half[rank:] ** 2, axis=1),
         solution[rank:],
         inverse,
@@ -521,7 +539,6 @@ def _finished(
         value,
         problem.expand(solution),
         weighted,
-        precision - precision @ spread @ precision,
         1.0 - np.diag(inverse)[rank:],
         solution[rank:],
         rows,

@@ -18,6 +18,9 @@ from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, JointFunctions
 from calib_planner.identification.likelihood import LinearProblem
 
+ENOUGH = 200
+"""Visits whose mean variance stands for that of all."""
+
 
 @dataclass(frozen=True, eq=False)
 class TermGain:
@@ -89,11 +92,16 @@ def _squares(problem: LinearProblem, coefficients: FloatArray) -> dict[str, floa
 
 
 def _variances(problem: LinearProblem, covariance: FloatArray) -> dict[str, float]:
-    """Term with columns → sum of the variances of what it moves the measured points by [m²]."""
-    result = {}
+    """Term with columns → sum of the variances of what it moves the measured points by [m²].
+
+    Of many visits each so many-th stands for the others: a mean of ``ENOUGH`` of them is known to a few percent.
+    """
+    result, every = {}, -(-len(problem.y) // ENOUGH)
+    rise = problem.seen.sum() / max(problem.seen[::every].sum(), 1.0)
     for name, place, share in _columns(problem):
-        columns = (problem.columns[:, :, place] * share).reshape(problem.y.size, -1)
-        result[name] = float(np.sum((columns.T @ columns) * covariance[place, place]))
+        columns = problem.columns[::every, :, place] * share
+        columns = columns.reshape(columns.shape[0] * columns.shape[1], -1)
+        result[name] = float(rise * np.sum((columns.T @ columns) * covariance[place, place]))
     return result
 
 

@@ -155,6 +155,24 @@ def test_standard_deviations_that_came_with_the_points_weigh_them_and_are_expect
     np.testing.assert_array_equal(again.predict(data.q).mean, found.knowledge.predict(data.q).mean)
 
 
+# ── big starts ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_zeros_off_by_15_degrees_and_lengths_by_50_mm_are_found() -> None:
+    """The tolerances expect a hundredth of that; with them alone the way to the minimum is too crooked."""
+    robot = ur10e(1)
+    rng = np.random.default_rng(83)
+    true = {n: float(rng.uniform(-0.26, 0.26)) for n in robot.parameter_names if n.endswith("joint.rz")}
+    true |= {"shoulder_lift_joint.x": 0.05, "wrist_3_joint.z": -0.05}
+    q = random_configurations(robot, 90, 83)
+    points = robot.with_deviations(true).positions(q) + rng.normal(0.0, 3e-5, (90, 1, 3))
+    data = Measurements(robot.joint_names, q, points)
+    found = fit_error_model(unknown(robot), data.select(np.arange(30)), typical())
+    distance, ratio = fresh_errors(found, data, 30)
+    assert found.converged and not found.doubt.any()
+    assert distance.max() < 3e-4 and 0.7 < ratio < 1.4
+
+
 # ── gross errors ─────────────────────────────────────────────────────────────────────────────────────
 
 
