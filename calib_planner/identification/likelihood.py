@@ -212,7 +212,7 @@ class Solution:
 
     @cached_property
     def blocks(self) -> FloatArray:
-        """(N, m, m) P_ii [1/m²]; many solutions are never asked for them."""
+        """(N, m, m) P_ii [1/m²]; many solutions never need them."""
         raise NotImplementedError
 
     def project(self, vectors: FloatArray) -> FloatArray:
