@@ -35,7 +35,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning.criteria import Criterion, Determinant, Eliminating, log_values
+from calib_planner.planning.criteria import Accuracy, Criterion, Determinant, Eliminating, log_values
 from calib_planner.planning.extended import LinearisedExtension
 from calib_planner.robot import analyse
 
@@ -412,11 +412,11 @@ class _Together:
         """Exchange ``rows`` in place until that pays no more; returns the number of exchanges tried."""
         log_value, tried = _mean_log_value(problem, rows), 1
         for _ in range(MOST_PASSES):
-            improved = False
+            improved, gains = False, self._seen(rows)
             for position in range(problem.size):
                 if cancel():
                     return tried
-                shortlist = self._best(self._seen(rows), rows)
+                shortlist = self._best(gains.copy(), rows)
                 others = np.delete(rows, position)
                 every = (problem, *problem.beside)
                 trial = np.mean([_with_one_more(p, others, shortlist) for p in every], axis=0)
@@ -458,7 +458,20 @@ class _Together:
 
 
 def _with_one_more(problem: ChoiceProblem, others: IntArray, new: IntArray) -> FloatArray:
-    """log Ψ of the rows ``others`` with each of ``new`` (K,): (K,)."""
+    """log Ψ of the rows ``others`` with each of ``new`` (K,): (K,).
+
+    For accuracies 1/tr(A M⁻¹) by Woodbury's identity, U being what a row adds and C the inverse without it:
+    tr A (C⁻¹ + UᵀU)⁻¹ = tr A C − tr (I + U C Uᵀ)⁻¹ U C A C Uᵀ.
+    """
     assert problem.together is not None
     added = problem.together.rows(new).given(problem.together.rows(others))
-    return _log_values(problem, _information(problem, others) + np.swapaxes(added, 1, 2) @ added)
+    matrix = _information(problem, others)
+    if not isinstance(problem.criterion, Accuracy):
+        return _log_values(problem, matrix + np.swapaxes(added, 1, 2) @ added)
+    inverse = np.linalg.inv(matrix + 1e-13 * np.diag(np.diag(matrix)))
+    half = inverse @ problem.criterion.weight
+    turned = np.swapaxes(added, 1, 2)
+    inner = np.eye(added.shape[1]) + added @ inverse @ turned
+    gained = np.linalg.solve(inner, added @ (half @ inverse) @ turned)
+    left = np.trace(half) - np.einsum("kii->k", gained)
+    return np.where(left > 0.0, -np.log(np.maximum(left, 1e-300)), -np.inf)
