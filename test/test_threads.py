@@ -32,7 +32,7 @@ def two_threads():
 
 def test_identify_keeps_to_one(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr(solver, "check_units", lambda *_: seen.append(threads()))
+    monkeypatch.setattr(solver, "explain_gross", lambda *_: seen.append(threads()))
     robot = Robot.load("planar_2r")
     cell = SimulatedCell(robot, random_deviations(robot, 1))
     q = np.random.default_rng(0).uniform(-2, 2, (6, 2))

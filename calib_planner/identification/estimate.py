@@ -22,6 +22,7 @@ from scipy.special import chdtrc, chdtri
 
 from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
 from calib_planner.error_model import Knowledge, to_mapping
+from calib_planner.identification.alternatives import Alternative
 from calib_planner.identification.estimation import ModelEstimate
 from calib_planner.identification.term_gain import TermGain
 from calib_planner.measurements import RejectedPoint
@@ -420,6 +421,7 @@ class Estimate:
         left_out: Error of visits that all others predict, beside its prediction.
         placement_alone: The same of ``calibrated``.
         terms: Every term of the error problem's model, with size and gain.
+        alternatives: Single changes of what was assumed that explain the data better, the best first.
         seconds: Time spent.
         validation: Statistics on held-out data, if any was given.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.
@@ -437,6 +439,7 @@ class Estimate:
     left_out: LeftOutError
     placement_alone: LeftOutError
     terms: tuple[TermGain, ...]
+    alternatives: tuple[Alternative, ...]
     seconds: float
     validation: Validation | None = None
     verdict: Verdict = UNJUDGED
@@ -499,6 +502,7 @@ class Estimate:
                 "terms": [asdict(t) for t in self.terms],
                 "model": to_mapping(self.knowledge.model),
             },
+            "alternatives": [asdict(a) for a in self.alternatives],
             "iterations": fit.iterations,
             "status": fit.status,
             "message": fit.message,

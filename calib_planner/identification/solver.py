@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.error_model import ErrorModel, Knowledge
 from calib_planner.errors import InputError, NotEnoughDataError
+from calib_planner.identification.alternatives import Alternative, explain_gross, find_alternatives
 from calib_planner.identification.doubt import gate_of, squares_of_points
 from calib_planner.identification.estimate import (
     Accuracy,
@@ -48,8 +49,6 @@ BLIND = 1e-5
 """Least motion of a point that tells that a test pose feels what the data cannot see [m per unit]."""
 WEAK = 1e-2
 """Directions of unit-length columns with less than this length are hardly seen."""
-WRONG_UNIT = (200.0, 5000.0)
-"""Measured points spread this much wider than the model's: millimetres where metres are wanted."""
 
 
 @one_thread
@@ -66,7 +65,22 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         InputError: The points look like millimetres.
     """
     began = time.perf_counter()
-    check_units(problem.robot, problem.data)
+    mistake = None if start is not None else explain_gross(problem.robot, problem.data)
+    _refuse_units(mistake)
+    try:
+        estimate = _identify(problem, start, mistake, began)
+    except NotEnoughDataError as error:
+        if mistake is None:
+            raise
+        message = f"{error}; {mistake.text}: {mistake.advice}"
+        raise NotEnoughDataError(error.have, error.need, message) from None
+    return judged(estimate)
+
+
+def _identify(
+    problem: IdentificationProblem, start: Estimate | None, mistake: Alternative | None, began: float
+) -> Estimate:
+    """The estimate without its verdict; ``mistake``: what is grossly wrong with the data."""
     check_count(problem, problem.data.seen)
     robot = start_robot(problem.robot, problem.data, robust=problem.robust)
     # A fit may run so far along what it cannot see that it seems to see it: this is decided first at the start.
@@ -78,7 +92,12 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         hidden = _hidden(problem.model, robot, poses.jacobian[rows])
         fit = _fit(problem, robot, hidden)
     check_count(problem, problem.data.seen & (fit.doubt == 0.0))
-    return _estimate(problem, fit, hidden, robot, began)
+    found: tuple[Alternative, ...] = ()
+    if mistake is not None:
+        found = (mistake,)
+    elif start is None and fit.converged and not problem.model.is_papers:
+        found = find_alternatives(robot, problem.data, fit, problem.test_pose_array, problem.accuracy_frame)
+    return _estimate(problem, fit, hidden, found, robot, began)
 
 
 # ── before the fit ───────────────────────────────────────────────────────────────────────────────────
@@ -115,31 +134,17 @@ def check_count(problem: IdentificationProblem, use: BoolArray) -> None:
 
 
 def check_units(robot: Robot, data: Measurements) -> None:
-    """Refuse points in millimetres, and a robot model in millimetres.
+    """Refuse points that are not in metres, and joint angles that are not in radians.
 
     Raises:
-        InputError: The points spread about a thousand times more, or less, than the robot can move them.
+        InputError: Another unit makes sense of data that make none as they are; says which.
     """
-    seen = data.seen
-    if seen.sum() < 3:
-        return
-    measured = _extent(data.p[seen])
-    expected = _extent(robot.positions(data.q)[seen])
-    if measured == 0.0 or expected == 0.0:
-        return
-    ratio = measured / expected
-    got = f"points {measured:.3g} apart where the robot model moves them by {expected:.3g}"
-    if WRONG_UNIT[0] < ratio < WRONG_UNIT[1]:
-        advice = "they look like millimetres: divide by 1000 (command line: --millimetres)"
-        raise InputError("points", got, "coordinates in metres", advice)
-    if WRONG_UNIT[0] < 1.0 / ratio < WRONG_UNIT[1]:
-        advice = "the model's lengths look like millimetres: give them in metres"
-        raise InputError("robot", got, "lengths in metres", advice)
+    _refuse_units(explain_gross(robot, data))
 
 
-def _extent(points: FloatArray) -> float:
-    """Median distance from the median point [m]: blind to a few gross errors."""
-    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+def _refuse_units(mistake: Alternative | None) -> None:
+    if mistake is not None and mistake.code == "units":
+        raise InputError("measurements", mistake.text, "metres and radians", mistake.advice)
 
 
 def place_nominal(problem: IdentificationProblem, start: Robot | None = None) -> Robot:
@@ -241,10 +246,11 @@ def _estimate(
     problem: IdentificationProblem,
     fit: ModelEstimate,
     hidden: Identifiability,
+    found: tuple[Alternative, ...],
     start: Robot,
     began: float,
 ) -> Estimate:
-    """The answer, with its verdict."""
+    """The answer, without its verdict."""
     data, model, names = problem.data, problem.model, start.parameter_names
     known, alone = _with_fixed(fit.knowledge, names), placement_alone(fit)
     seen, use = data.seen, data.seen & (fit.doubt == 0.0)
@@ -266,7 +272,7 @@ def _estimate(
     off = _point_rows(problem, predicted, normalised, seen & ~use, gate)
     suspects = _point_rows(problem, predicted, normalised, use & (np.nan_to_num(normalised) > gate), gate)
     calibrated = _with_fixed(alone.knowledge, names).placed
-    estimate = Estimate(
+    return Estimate(
         calibrated=calibrated,
         knowledge=known,
         fit=ParameterFit(
@@ -312,10 +318,10 @@ def _estimate(
         left_out=_left_out_error(fit.left_out, fit, source),
         placement_alone=_left_out_error(alone.left_out, fit, source),
         terms=fit.terms,
+        alternatives=found,
         seconds=time.perf_counter() - began,
         model_fit=fit,
     )
-    return judged(estimate)
 
 
 def _prior_words(model: ErrorModel) -> str:

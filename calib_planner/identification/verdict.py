@@ -24,8 +24,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import bdtr
 
+from calib_planner.identification.alternatives import TABLE
 from calib_planner.identification.estimate import (
     CHANCE,
+    LEVELS,
     Estimate,
     LeftOutError,
     Reason,
@@ -43,6 +45,8 @@ LITTLE = 0.5
 """Share of the error before that is left after a fit that explains little."""
 INSIDE = 0.8
 """Share of the held-out points below which too few of them lie in their 95 % region."""
+HARMFUL = 3.0
+"""Predicted standard deviations by which predictions may move because of a fault: a normal error hardly does."""
 APART = 1.5
 """Achieved over predicted error beyond which a prediction is not kept."""
 SYSTEMATIC = ("gravity", "smooth", "short")
@@ -208,7 +212,9 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
 LIMITS = {"rejected": (0.05, 0.20), "predicted_and_achieved": (APART, 3.0), "left_out": (APART, 3.0)}
 """Reason → share of the points, and achieved over predicted error as far as chance does not explain it, beyond
 which its level is WARN and FAIL."""
-RULES = {key: Rule(key.partition(":")[0], text, advice) for key, text, advice in _TABLE}
+RULES = {key: Rule(key.partition(":")[0], text, advice) for key, text, advice in _TABLE[:1]}
+RULES |= {f"alternative: {a.code}": Rule(a.code, a.text, _each(a.advice, *LEVELS)) for a in TABLE.values()}
+RULES |= {key: Rule(key.partition(":")[0], text, advice) for key, text, advice in _TABLE[1:]}
 """Everything that a verdict on an estimate can say, the most important first. A key is the code, with a word
 behind it where one code has several texts."""
 _IMPORTANCE = {code: rank for rank, code in reversed(list(enumerate(rule.code for rule in RULES.values())))}
@@ -227,8 +233,8 @@ def judged(estimate: Estimate) -> Estimate:
 
 def judge(estimate: Estimate) -> Verdict:
     """The verdict on everything else that the estimate says; of one level the most important reason first."""
-    checks = (_solution, _data, _rejections, _scatter, _left_out, _parameters, _accuracy, _held_out)
-    reasons = [reason for check in checks for reason in check(estimate)]
+    checks = (_solution, _alternatives, _data, _rejections, _scatter, _left_out, _parameters, _accuracy)
+    reasons = [reason for check in (*checks, _held_out) for reason in check(estimate)]
     return Verdict.of(sorted(reasons, key=lambda r: _IMPORTANCE[r.code]))
 
 
@@ -243,6 +249,13 @@ def _solution(e: Estimate) -> Iterator[Reason]:
     elif after.mean > 0.9 * before.mean:
         level = "PASS" if _is_noise(e, before.rms) else "WARN"
         yield RULES["no_gain"].reason(level, before=length(before.mean), after=length(after.mean))
+
+
+def _alternatives(e: Estimate) -> Iterator[Reason]:
+    """What explains the data better counts as far as it moves predictions at the test poses."""
+    for a in e.alternatives:
+        harmful = a.material and (a.deviations > HARMFUL or TABLE[a.code].kind == "gross")
+        yield Reason("FAIL" if harmful else "WARN" if a.material else "PASS", a.code, a.text, a.advice)
 
 
 def _is_noise(e: Estimate, rms: float) -> bool:

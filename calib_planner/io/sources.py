@@ -114,7 +114,7 @@ def read_source(path: str, robot: Robot, settings: SourceSettings) -> Source:
     """Read a CSV file or a bag.
 
     Raises:
-        FileFormatError: As ``read_measurements`` and ``read_bag``, or the points are in millimetres.
+        FileFormatError: As ``read_measurements`` and ``read_bag``, or the file is in other units.
     """
     source = (_bag if is_bag(path) else _csv)(path, robot, settings)
     count = source.data.p.shape[1]
@@ -122,9 +122,7 @@ def read_source(path: str, robot: Robot, settings: SourceSettings) -> Source:
     try:
         check_units(alike, source.data)
     except InputError as error:
-        doubtful = settings.millimetres and error.field == "robot"
-        advice = "they are metres already: leave out --millimetres" if doubtful else error.advice
-        raise FileFormatError(path, error.field, error.got, error.expected, advice) from None
+        raise FileFormatError(path, error.field, error.got, error.expected, error.advice) from None
     return source
 
 
