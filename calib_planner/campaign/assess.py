@@ -92,10 +92,10 @@ class Assessment:
 
     @property
     def model(self) -> ErrorModel:
-        """All terms that were asked for, with the sizes that are known by now and the noise as estimated."""
-        asked, now = self.problem.model, self.estimate.knowledge.model
-        values = {n: v for n, v in now.values.items() if n in asked.values}
-        return replace(asked.with_values(values), points=now.points)
+        """All terms that were wanted, with the sizes that are known by now and the noise as estimated."""
+        wanted, now = self.problem.model, self.estimate.knowledge.model
+        values = {n: v for n, v in now.values.items() if n in wanted.values}
+        return replace(wanted.with_values(values), points=now.points)
 
     @property
     def used(self) -> Measurements:

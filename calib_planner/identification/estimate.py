@@ -189,6 +189,7 @@ class Residuals:
         after: Of the points used, with all that was identified.
         placement_alone: Of the points used, from where ``Estimate.calibrated`` has them.
         sigma: Scatter of one coordinate about the fit [m], NaN without redundancy.
+        spare: Measured coordinates less those that the fit has used up: what is left to judge it by.
         chi_square: Whether measurement noise alone explains them.
     """
 
@@ -199,6 +200,7 @@ class Residuals:
     after: ResidualStatistics
     placement_alone: ResidualStatistics
     sigma: float
+    spare: float
     chi_square: ChiSquare
 
     def __post_init__(self) -> None:

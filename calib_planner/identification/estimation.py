@@ -48,6 +48,7 @@ from calib_planner.identification.likelihood import (
     scale_covariance,
     solve,
     updatable,
+    with_points_moved,
     with_uncertain_scales,
 )
 from calib_planner.identification.registration import place, tip_poses
@@ -92,6 +93,8 @@ OFF = 1.25
 """Squared left-out residuals, over what is predicted, that change by this factor show that the scales are off."""
 BASE_ELEMENTS = 9
 """The first elements of a robot place its base (``Robot.with_base``)."""
+CHORDS = 8
+"""Most steps of an update with the columns as they are; then all visits are linearised anew."""
 BENDS = 3e-2
 """Share of a point's standard deviation that kinematics and linearisation may differ by: it is not seen."""
 OPTIONAL = ("short", "smooth", "gravity")
@@ -243,8 +246,11 @@ class _Work:
         poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
         return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
 
-    def bends(self, solution: Solution) -> bool:
-        """Whether the kinematics leave other residuals at the state than the linear problem does."""
+    def bent(self, solution: Solution) -> FloatArray | None:
+        """(N, m) by how much the kinematics leave other residuals at the state than the linear problem does [m].
+
+        ``None`` where that is not seen (``BENDS``).
+        """
         problem = solution.problem
         straight = (problem.covariance @ solution.weighted[:, :, None])[:, :, 0] * problem.seen
         apart = np.where(
@@ -252,7 +258,8 @@ class _Work:
         )
         usual = problem.covariance - problem.parts.get("doubt", 0.0)
         allowed = BENDS * np.sqrt(np.diagonal(usual, axis1=1, axis2=2)) + LEAST
-        return bool((np.abs(straight - apart.reshape(straight.shape)) > allowed).any())
+        difference = apart.reshape(straight.shape) - straight
+        return difference if (np.abs(difference) > allowed).any() else None
 
     def start(self, model: ErrorModel) -> None:
         """Relinearise at the scales of ``model``, but with wide tolerances: a narrow prior that fights the data
@@ -570,15 +577,20 @@ def _updated(
         problem = replace(problem, parts=_with_doubt(problem.parts, doubt))
         problem.__dict__["flat"], problem.__dict__["random"] = old.flat, old.random
         solution = exchange(solution, problem, np.arange(len(data)))
-    coefficients = solution.coefficients.copy()
-    coefficients[flat] += reference
-    coefficients[old.random] += old.means
-    work.state = _State(coefficients, old.model, doubt)
-    work.rounds, work.converged = 1, True
-    final: Solution = solution
-    if work.bends(solution):
+    final: Solution | None = None
+    for _ in range(CHORDS):
+        coefficients = solution.coefficients.copy()
+        coefficients[flat] += reference
+        coefficients[old.random] += old.means
+        work.state = _State(coefficients, old.model, doubt)
+        work.rounds, work.converged = work.rounds + 1, True
+        bent = work.bent(solution)
+        if bent is None:
+            final = solution
+            break
+        solution = with_points_moved(solution, bent)
+    if final is None:
         final = work.settle(4, 0)
-        work.rounds += 1
     left = left_out(final, work.groups)
     surprise = _surprise(left)
     if not origin.surprise / OFF < surprise < origin.surprise * OFF:

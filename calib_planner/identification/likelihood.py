@@ -508,6 +508,22 @@ def exchange(solution: UpdatedSolution, problem: LinearProblem, old: IntArray) -
     )
 
 
+def with_points_moved(solution: UpdatedSolution, change: FloatArray) -> UpdatedSolution:
+    """The solution if y (N, m) had been larger by ``change`` [m]."""
+    before = solution.problem
+    problem = replace(before, y=before.y + change)
+    for name in ("flat", "random", "root", "ratios", "basis", "flat_columns", "scaled_columns", "covariance"):
+        problem.__dict__[name] = getattr(before, name)
+    return _finished(
+        problem,
+        solution.rows,
+        solution.precision,
+        solution.inverse,
+        solution.log_determinant,
+        solution.spread,
+    )
+
+
 def _rows(visits: IntArray, size: int) -> IntArray:
     """Numbers of the coordinates of ``visits``, ``size`` each."""
     return (size * visits[:, None] + np.arange(size)).ravel()

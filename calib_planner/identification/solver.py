@@ -311,6 +311,7 @@ def _estimate(
                 np.linalg.norm(data.p - calibrated.positions(data.q), axis=2)[use]
             ),
             sigma=scatter,
+            spare=_spare(fit),
             chi_square=ChiSquare(chi, int(linear.seen.sum()) - flat),
         ),
         noise=PointNoise(_point_sigma(fit, use), source),
@@ -344,16 +345,20 @@ def _left_out_error(left: LeftOut, fit: ModelEstimate, source: str) -> LeftOutEr
 
 
 def _freedom_left_out(left: LeftOut, fit: ModelEstimate) -> float:
-    """Degrees of freedom of the mean square left-out distance, as a χ²: no more than there are equations that
-    the flat parameters leave.
+    """Degrees of freedom of the mean square left-out distance, as a χ²: no more than the fit leaves.
 
     A χ² with f degrees of freedom has a root mean square of standard deviation 1/√(2f) of its expectation.
     """
     if not left.usable.any():
         return 0.0
+    return float(min(0.5 / left.excess[1] ** 2, _spare(fit)))
+
+
+def _spare(fit: ModelEstimate) -> float:
+    """Measured coordinates less those that the fit has used up, tr(R P): n − p for plain least squares."""
     linear = fit.solution.problem
-    spare = float(linear.seen.sum()) - linear.basis.shape[1]
-    return float(min(0.5 / left.excess[1] ** 2, max(spare, 0.0)))
+    shares = np.einsum("nij,nji->ni", linear.covariance, fit.solution.blocks) * linear.seen
+    return float(np.clip(shares, 0.0, 1.0).sum())
 
 
 def _variances(part: FloatArray, use: BoolArray) -> FloatArray:

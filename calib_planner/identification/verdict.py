@@ -48,7 +48,8 @@ INSIDE = 0.8
 HARMFUL = 3.0
 """Predicted standard deviations by which predictions may move because of a fault: a normal error hardly does."""
 APART = 1.5
-"""Achieved over predicted error beyond which a prediction is not kept."""
+"""Achieved over predicted error beyond which a prediction does not hold; measurements are too few where chance
+makes as much of nothing (``chance_of``)."""
 SYSTEMATIC = ("gravity", "smooth", "short")
 """Terms of an error model that move the robot the same each time, beside its geometry."""
 IMPROBABLE_FIT, TOO_GOOD_FIT = 1e-3, 1.0 - 1e-6
@@ -120,7 +121,7 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
     (
         "no_gain_left_out",
         "visits left out in turn are no better than before: {after}, before {before}",
-        {"FAIL": "do not apply it: free fewer parameters or measure more"},
+        _each("do not apply it: free fewer parameters or measure more", "WARN", "FAIL"),
     ),
     (
         "predicted_and_achieved",
@@ -150,7 +151,7 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
     ),
     (
         "too_few_measurements",
-        "so few measurements that the left-out error may by chance be {factor} times what is predicted",
+        "too few measurements: the fit leaves {spare} of their coordinates to judge it by",
         {"WARN": "measure more configurations than the parameters need, or ask for fewer parameters"},
     ),
     (
@@ -304,12 +305,12 @@ def _left_out(e: Estimate) -> Iterator[Reason]:
     if not left.count:
         yield RULES["unproven"].reason()
         return
-    factor = chance_of(left.freedom)
-    if factor > APART:
-        said = f"{factor:.2g}" if np.isfinite(factor) else "any number of"
-        yield RULES["too_few_measurements"].reason(factor=said)
+    few = chance_of(e.residuals.spare) > APART
+    if few:
+        yield RULES["too_few_measurements"].reason(spare=f"{e.residuals.spare:.1f}")
     if left.mean >= before and not e.accuracy.overall < before:
-        yield RULES["no_gain_left_out"].reason(after=length(left.mean), before=length(before))
+        level = "WARN" if few else "FAIL"
+        yield RULES["no_gain_left_out"].reason(level, after=length(left.mean), before=length(before))
     predicted = length(left.predicted_rms)
     yield _graded("left_out", _exceeded(left), achieved=length(left.rms), predicted=predicted)
     if np.isfinite(required) and not len(e.accuracy.predicted):

@@ -179,7 +179,10 @@ def _made(node: Node, kind: type[T], more: tuple[str, ...] = ()) -> T | None:
 
 def _noise(node: Node) -> PointNoise | None:
     """Noise of a point; older files split it in another way, which is left aside."""
-    if node.value is None or "measurement" in node:
+    if node.value is None:
+        return None
+    node.mapping()
+    if "measurement" in node:
         return None
     node.mapping(None, ("sigma", "source"))
     return PointNoise(_float(node["sigma"]), node["source"].of_kind("str"))

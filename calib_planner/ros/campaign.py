@@ -44,7 +44,7 @@ from calib_planner.ros.settings import CampaignParameters, unknown_words
 from calib_planner.units import cut, listed
 
 SAME = ("budget", "batch", "validation", "minimum", "attempts", "most_failures", "exclusion", "sigma", "starts",
-        "time_limit", "seed")  # fmt: skip
+        "time_limit", "seed", "accuracy_frame")  # fmt: skip
 """Parameters that are fields of ``CampaignProblem``."""
 
 

@@ -171,6 +171,8 @@ def _estimate(session: Session) -> Finding:
         "outliers": len(estimate.points.rejected),
         "noise of a coordinate [m]": f"{estimate.noise.sigma:.3g}",
         "residual rms [m]": f"{estimate.residuals.after.rms:.3g}",
+        "left-out error rms [m]": f"{estimate.left_out.rms:.3g}",
+        "left-out error predicted [m]": f"{estimate.left_out.predicted_rms:.3g}",
         "predicted accuracy [m]": f"{estimate.accuracy.overall:.3g}",
         "verdict": estimate.verdict.level,
         "seconds": f"{estimate.seconds:.4f}",

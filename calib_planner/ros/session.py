@@ -4,10 +4,15 @@ A session belongs to one plan (or to none). A plan with another name begins a ne
 back is met with what was measured of it. Everything is in the store before it counts here, so that a session made
 from the same store is the same session.
 
-Which points to believe is decided by all measurements together, from the beginning, every time one comes or goes
-(χ² against the estimate from the others, ``identification.robust``): later measurements may show that a point was
-no outlier. What changes is published and stored, nothing is deleted. The estimate depends on the measurements in
-use and on nothing else, so that it is the same after a restart.
+Which points to believe is decided by all measurements together, every time one comes or goes (each against where
+the others put it): later measurements may show that a point was no outlier. What changes is published and stored,
+nothing is deleted.
+
+While a plan is being measured the estimate before is brought up to date (``identify`` with a start), in
+milliseconds and with the sizes of the errors that the last full fit gave; when the visits have grown by a quarter
+a full fit is made anew. Once a plan is complete, for files and after a restart it is always a full fit, which
+depends on the measurements in use and on nothing else. So what is published of a complete plan and what is saved
+are the same after a restart; what is published in between may differ by a fraction of its standard deviations.
 
 Files are saved in the folder that the user chose and nowhere else. Their names are made of the plan's name, which
 comes over the wire: only letters, digits, ``-`` and ``_`` of it become part of a file name, with a hash where
@@ -28,6 +33,7 @@ import numpy as np
 
 from calib_planner.acquisition import Rejection, Standstill, mean_std
 from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel
 from calib_planner.errors import CalibPlannerError, InputError, NotEnoughDataError, StoreError, UnknownNameError
 from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.io import (
@@ -65,6 +71,8 @@ class Matching:
         sigma: Standard deviation of one coordinate of one sample [m]; 0: from the scatter of the samples.
         repeatability: Standard deviation that averaging does not reduce [m].
         most: Largest number of measurements in use.
+        error_model: How robot and measurement err; ``None``: all terms at typical sizes.
+        accuracy_frame: Of the accuracy at the plan's test poses: ``world`` or ``robot``.
     """
 
     tolerance: float = 0.01
@@ -72,6 +80,8 @@ class Matching:
     sigma: float = 3e-5
     repeatability: float = 0.0
     most: int = 5000
+    error_model: ErrorModel | None = None
+    accuracy_frame: str = "world"
 
 
 @dataclass(frozen=True)
@@ -95,6 +105,7 @@ class Session:
         robot: The robot whose parameters are identified now.
         records: The measurements in use, in the order of measuring: accepted, or an outlier at present.
         newest: The estimate from ``records``; ``None`` if it has to be made anew.
+        settled: Whether ``newest`` is a full fit.
 
     Raises:
         CalibPlannerError: What the store holds does not fit the robot.
@@ -104,6 +115,8 @@ class Session:
         self.nominal, self.robot, self.follow, self.store = nominal, nominal, follow, store
         self.records: list[Record] = []
         self.newest: Estimate | TooFew | None = None
+        self.settled = False
+        self._start: Estimate | None = None
         self._unsaved: dict[int, Record] = {}
         self._others: Counter[str] = Counter()
         self._enter(store.current() or StoredSession(0, "", None, ()))
@@ -143,7 +156,7 @@ class Session:
         self.number, self.plan_id, self.plan, self.robot = stored.number, stored.plan_id, stored.plan, robot
         self.records = [r for r in stored.records if r.status in KEPT]
         self._others = Counter(r.status for r in stored.records if r.status not in KEPT)
-        self.newest, self._unsaved = None, {}
+        self.newest, self.settled, self._start, self._unsaved = None, False, None, {}
 
     def _ensure_begun(self) -> int:
         """Number of the session, which is in the store from now on."""
@@ -291,12 +304,17 @@ class Session:
         poses = self.plan.test_poses if self.plan is not None and len(self.plan.test_poses) else None
         if data is None:
             raise NotEnoughDataError(0, len(self.robot.parameter_names), "nothing was measured yet")
-        return IdentificationProblem(self.robot, data, loss="robust", test_poses=poses)
+        frame = "world" if poses is None else how.accuracy_frame
+        return IdentificationProblem(
+            self.robot, data, error_model=how.error_model, test_poses=poses, accuracy_frame=frame
+        )
 
-    def estimate(self, how: Matching) -> Estimate | TooFew:
-        """Identify with the measurements in use."""
+    def estimate(self, how: Matching, *, settled: bool = False) -> Estimate | TooFew:
+        """Identify with the measurements in use; in full if ``settled`` or once the plan is complete."""
+        start = None if settled or self.complete else self._start
         try:
-            self.newest = identify(self.problem(how))
+            self.newest = self._start = identify(self.problem(how), start)
+            self.settled = start is None
         except NotEnoughDataError as error:
             each = 3 * len(self.robot.targets)
             missing = max(-(-(error.need - error.have) // each), 0)
@@ -305,6 +323,12 @@ class Session:
         except (CalibPlannerError, ArithmeticError, ValueError) as error:
             self.newest = TooFew(0, f"identification failed: {error}")
         return self.newest
+
+    def settle(self, how: Matching) -> Estimate | TooFew:
+        """The full fit of the measurements in use."""
+        if self.newest is not None and (self.settled or isinstance(self.newest, TooFew)):
+            return self.newest
+        return self.estimate(how, settled=True)
 
     def judge(self) -> list[Record]:
         """Apply to ``records`` which points the newest estimate rejects; returns the records that changed.
@@ -393,7 +417,7 @@ def save(folder: str, session: Session, how: Matching, urdf: str = "") -> list[P
     name = plan_name(session.plan_id)
     paths = [confined(folder, f"measurements_{name}.csv")]
     write_measurements(paths[0], data, FIELD)
-    estimate = session.newest or session.estimate(how)
+    estimate = session.settle(how)
     if isinstance(estimate, Estimate):
         paths.append(confined(folder, f"estimate_{name}.yaml"))
         write_estimate(paths[-1], estimate, FIELD)
@@ -413,7 +437,7 @@ def report(folder: str, session: Session, how: Matching) -> Path:
     from calib_planner.report import InputFile, Provenance, write_report  # templates: a node starts without them
 
     path = confined(folder, f"report_{plan_name(session.plan_id)}.html")
-    estimate = session.newest or session.estimate(how)
+    estimate = session.settle(how)
     if not isinstance(estimate, Estimate):
         raise NotEnoughDataError(0, 1, f"there is no estimate to report yet: {estimate.message}")
     model = session.store.model

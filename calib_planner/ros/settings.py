@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib_planner.acquisition import StandstillSettings
+from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.io import config_folder
 from calib_planner.planning import CRITERIA
@@ -27,6 +28,8 @@ from calib_planner.units import cut
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas between"
 UNKNOWN = "what else is unknown: base, tool or base,tool"
 CONSTRAINTS = "what may be measured: name of a file in constraints_folder; empty = joint limits only"
+ERROR_MODEL = "how the robot errs: typical, paper (noise alone), or the path of a YAML file, also an estimate"
+FRAME = "accuracy at the test poses: in the frame of the points (world), or up to a rigid motion (robot)"
 TOPICS = "topics of the tracker's points, one per target"
 LARGEST_SEED = 2**31 - 1
 
@@ -98,6 +101,8 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
     repeatability: float = parameter(
         0.0, "scatter that averaging does not reduce (robot, reflector)", "m", 0.0, 1.0
     )
+    error_model: str = at_configure("typical", ERROR_MODEL)
+    accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
     plan_topic: str = at_configure("calibration_planner/current_plan", "topic of the plan")
     plan_tolerance: float = parameter(
@@ -198,7 +203,8 @@ class CampaignParameters(PlanParameters):
         0.5,
     )
     sigma: float = parameter(1e-5, "expected noise of one coordinate of one measurement", "m", 1e-9, 1.0)
-    error_model: str = parameter("typical", "how the robot errs: typical, paper, or the path of a YAML file")
+    error_model: str = parameter("typical", ERROR_MODEL)
+    accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
     starts: int = parameter(16, "random starts of the search of a plan", "", 1, 100000)
     seed: int = parameter(0, "seed of the plans", "", 0, LARGEST_SEED)
     store_folder: str = parameter(

@@ -26,6 +26,7 @@ from calib_planner.identification.likelihood import (
     scale_covariance,
     unknown_scales,
     updatable,
+    with_points_moved,
     with_uncertain_scales,
 )
 
@@ -182,6 +183,15 @@ def test_visits_that_come_go_and_lose_weight_are_the_same_as_solving_anew(target
         (changed.coefficients_of(rows), anew.coefficients_of(rows)),
     ]
     for a, b in pairs:
+        np.testing.assert_allclose(a, b, atol=2e-6 * np.abs(b).max())
+
+
+def test_points_that_moved_are_the_same_as_solving_anew() -> None:
+    problem = problem_of(12, 2, missing=((4, 0),))
+    change = 1e-4 * np.random.default_rng(1).standard_normal(problem.y.shape) * problem.seen
+    moved = with_points_moved(updatable(dense(problem)), change)
+    anew = by_coefficients(replace(problem, y=problem.y + change))
+    for a, b in ((moved.coefficients, anew.coefficients), (moved.weighted, anew.weighted)):
         np.testing.assert_allclose(a, b, atol=2e-6 * np.abs(b).max())
 
 

@@ -26,9 +26,8 @@ from calib_planner import (
     identify,
     plan,
 )
-from calib_planner.error_model import Prior
-from calib_planner.identification import JointCorrections, cross_validate, validate
-from calib_planner.identification.transmission import Transmission
+from calib_planner.error_model import ErrorModel, Prior
+from calib_planner.identification import validate
 from calib_planner.io import read_estimate, read_plan, write_estimate, write_plan
 from calib_planner.io.plan import FINITE as FINITE_ARRAYS
 from calib_planner.io.plan import SHAPES
@@ -162,9 +161,9 @@ def placed() -> Estimate:
     robot = nominal.with_parameters("full", ["base", "tool"])
     test = cell.measure(random_configurations(nominal, 8, 3), 1, 4)
     prior = Prior(("spin.z",), [0.5], [1e-3])
-    problem = IdentificationProblem(robot, data, test_poses=[[0.1, 0.2, 0.3, 0.4]], prior=prior)
-    found = identify(problem)
-    return cross_validate(problem, validate(problem, found, [test]), 3)
+    model = ErrorModel.paper()
+    problem = IdentificationProblem(robot, data, None, model, prior=prior, test_poses=[[0.1, 0.2, 0.3, 0.4]])
+    return validate(problem, identify(problem), [test])
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +201,10 @@ def test_estimates_come_back_to_the_bit(tmp_path: Path, placed: Estimate) -> Non
     assert read.predicted_accuracy_per_test_pose.tobytes() == placed.accuracy.predicted.tobytes()
     assert repr(read.noise) == repr(placed.noise) and repr(read.chi_square) == repr(placed.residuals.chi_square)
     assert read.verdict == placed.verdict
-    assert {k: v for k, v in read.document.items() if k in placed.to_dict()} == placed.to_dict()
+    said = placed.to_dict()
+    written = {k: v for k, v in read.document.items() if k in said}
+    learnt = written["error_model"]
+    assert written | {"error_model": {k: learnt[k] for k in said["error_model"]}} == said
     write_estimate(again, read)
     assert again.read_bytes() == path.read_bytes()
 
@@ -216,7 +218,9 @@ def test_a_read_estimate_is_the_robot_again(tmp_path: Path, placed: Estimate) ->
         again = read_estimate(path).calibrated(nominal)
         assert again.positions(q).tobytes() == placed.calibrated.positions(q).tobytes()
         assert again.jacobian(q).tobytes() == placed.calibrated.jacobian(q).tobytes()
-        np.testing.assert_array_equal(read_estimate(path).complete(nominal).positions(q), again.positions(q))
+        known = read_estimate(path).knowledge(nominal)
+        assert known.poses(q).points.tobytes() == placed.positions(q).tobytes()
+        assert known.predict(q).total.tobytes() == placed.knowledge.predict(q).total.tobytes()
     far = np.linalg.norm(again.positions(q) - mixed().positions(q), axis=2)
     assert far.min() > 0.1  # base and targets do matter
     with pytest.raises(InputError, match="joints turn, slide"):
@@ -225,26 +229,21 @@ def test_a_read_estimate_is_the_robot_again(tmp_path: Path, placed: Estimate) ->
         read_estimate(change(path, base=None)).calibrated(mixed())
 
 
-def test_joint_corrections_come_back(tmp_path: Path, placed: Estimate) -> None:
-    """Beside the geometry that belongs with them, which is not the calibrated robot's."""
-    rng = np.random.default_rng(3)
-    moved = placed.calibrated.with_deviations({"slide.x": 3e-4, "base.y": 1e-4, "target_2.x": -2e-4})
-    series = rng.normal(0, 1e-3, (2, 4, 5))
-    corrections = JointCorrections(moved.joint_names, np.full(4, 0.7), rng.normal(size=4), *series)
-    count = len(moved.parameter_names) + series.size
-    model = Transmission(moved, corrections, 0.3, 1e-3, 1e-5, 0.0, 9.0, moved.parameter_names, np.eye(count))
-    written = replace(placed, transmission=model)
-    write_estimate(tmp_path / "estimate.yaml", written)
-    read = read_estimate(tmp_path / "estimate.yaml")
-    found, q = read.joint_corrections, random_configurations(moved, 10, 8)
-    assert found is not None
-    again = read.complete(mixed()).positions(found.corrections.actual(q))
-    assert again.tobytes() == written.positions(q).tobytes()
-    assert read.calibrated(mixed()).positions(q).tobytes() == written.calibrated.positions(q).tobytes()
-    document = yaml.safe_load((tmp_path / "estimate.yaml").read_text())
-    document["joint_corrections"]["sines"] = [[0.0]]
-    with pytest.raises(FileFormatError, match=r"joint_corrections.sines: .*shape \(1, 1\)"):
-        read_estimate(change(tmp_path / "estimate.yaml", joint_corrections=document["joint_corrections"]))
+def test_all_terms_come_back(tmp_path: Path, small: Estimate) -> None:
+    """Gravity, joint functions and visits beside a placement that is not the calibrated robot's."""
+    path, q = tmp_path / "estimate.yaml", random_configurations(small.calibrated, 10, 8)
+    write_estimate(path, small)
+    nominal, read = Robot.load("planar_2r"), read_estimate(path)
+    known = read.knowledge(nominal)
+    assert known.model == small.knowledge.model and len(known.model.systematic) > 1
+    assert known.poses(q).points.tobytes() == small.positions(q).tobytes()
+    assert known.predict(q).total.tobytes() == small.knowledge.predict(q).total.tobytes()
+    assert known.predict(q).mean.tobytes() != read.calibrated(nominal).positions(q).tobytes()
+    assert read.calibrated(nominal).positions(q).tobytes() == small.calibrated.positions(q).tobytes()
+    names = [t["name"] for t in read.document["error_model"]["terms"]]
+    assert names == ["placement", "gravity", "smooth", "short", "visits", "points"]
+    assert set(read.document["left_out"]) >= {"count", "mean", "rms", "max", "predicted_rms"}
+    assert read.document["accuracy_frame"] == "world" and read.document["placement_alone"]["left_out"]
 
 
 def test_what_cannot_be_predicted_stays_infinite(tmp_path: Path) -> None:
@@ -252,7 +251,8 @@ def test_what_cannot_be_predicted_stays_infinite(tmp_path: Path) -> None:
     robot = Robot.load("planar_2r").with_parameters(["l1", "dq1", "dq2"])
     q = [[a, 0.0] for a in np.linspace(-2, 2, 12)]
     data = SimulatedCell(robot, {"l1": 1e-3}).measure(q, 1, 2)
-    estimate = identify(IdentificationProblem(robot, data, test_poses=[[0.1, 1.5], [0.2, 0.0]]))
+    poses = [[0.1, 1.5], [0.2, 0.0]]
+    estimate = identify(IdentificationProblem(robot, data, None, ErrorModel.paper(), test_poses=poses))
     assert np.isinf(estimate.accuracy.overall) and estimate.to_dict()["predicted_accuracy"] is None
     path = tmp_path / "estimate.yaml"
     write_estimate(path, estimate)
@@ -263,25 +263,30 @@ def test_what_cannot_be_predicted_stays_infinite(tmp_path: Path) -> None:
     assert (tmp_path / "again.yaml").read_bytes() == path.read_bytes()
 
 
-def test_an_estimate_without_redundancy_has_no_uncertainty(tmp_path: Path) -> None:
-    """As many equations as parameters: standard deviations are unknown, and stay so."""
+def test_an_estimate_without_redundancy_has_no_left_out_error(tmp_path: Path) -> None:
+    """As many equations as parameters: nothing is left to judge by, and the file says so."""
     robot = Robot.load("planar_2r").with_targets([[0.1, 0.2, 0.3]]).with_parameters(["l1", "dq1", "target_1.z"])
     q = np.array([[0.3, 0.5]])
     data = Measurements(robot.joint_names, q, robot.positions(q) + 1e-4)
-    estimate = identify(IdentificationProblem(robot, data))
-    assert np.isnan(estimate.fit.std).all() and np.isnan(estimate.noise.sigma)
+    estimate = identify(IdentificationProblem(robot, data, None, ErrorModel.paper()))
+    assert estimate.left_out.count == 0 and estimate.verdict.level != "PASS"
     write_estimate(tmp_path / "estimate.yaml", estimate)
     read = read_estimate(tmp_path / "estimate.yaml")
+    assert read.document["left_out"]["rms"] is None and read.document["left_out"]["count"] == 0
     np.testing.assert_array_equal(read.std, estimate.fit.std)
     np.testing.assert_array_equal(read.covariance, estimate.fit.covariance)
-    assert np.isnan(read.sigma) and read.deviations.tobytes() == estimate.fit.deviations.tobytes()
+    assert read.deviations.tobytes() == estimate.fit.deviations.tobytes()
 
 
 @pytest.fixture(scope="module")
 def small() -> Estimate:
+    """All terms, of a robot whose joints err as no geometry does."""
     robot = Robot.load("planar_2r")
-    data = SimulatedCell(robot, {"l1": 1e-3}).measure([[0.1, 0.5], [1.0, -0.5], [0.4, 1.2]], 1, 2)
-    return identify(IdentificationProblem(robot, data, test_poses=[[0.1, 0.2]]))
+    q = random_configurations(robot, 30, 5)
+    points = robot.with_deviations({"l1": 1e-3}).positions(q + 2e-3 * np.sin(2.0 * q))
+    points = points + 1e-5 * np.random.default_rng(2).standard_normal(points.shape)
+    data = Measurements(robot.joint_names, q, points)
+    return identify(IdentificationProblem(robot, data, 1e-5, test_poses=[[0.1, 0.2]]))
 
 
 @settings(max_examples=repeats(20, 40), deadline=None)
@@ -317,11 +322,13 @@ def test_any_numbers_come_back(small: Estimate, data: st.DataObject) -> None:
 def test_older_files_lack_what_has_a_default(tmp_path: Path, placed: Estimate) -> None:
     path = tmp_path / "estimate.yaml"
     write_estimate(path, placed)
-    noise = {k: v for k, v in yaml.safe_load(path.read_text())["noise"].items() if k not in ("point", "scaled")}
-    read = read_estimate(change(path, noise=noise, base=None, targets=None, verdict=None, chi_square=None))
-    assert read.noise is not None and read.noise.measurement == placed.noise.measurement
-    assert (read.noise.point, read.noise.scaled) == (0.0, 1.0)
+    noise = {"repeatability": 1e-5, "measurement": 2e-5, "discrepancy": 0.0, "source": "residuals"}
+    older = dict.fromkeys(("base", "targets", "verdict", "chi_square", "error_model"))
+    read = read_estimate(change(path, noise=noise, **older))
     assert (read.base, read.targets, read.verdict, read.chi_square) == (None, None, None, None)
+    assert read.noise is None and read.learnt is None
+    with pytest.raises(InputError, match=r"no error model.*identify again"):
+        read.knowledge(mixed())
 
 
 BAD_ESTIMATES: dict[str, tuple[dict[str, Any], str]] = {
@@ -333,14 +340,14 @@ BAD_ESTIMATES: dict[str, tuple[dict[str, Any], str]] = {
     "base": ({"base": {"x": 0.0}}, r"base\.y: .*no key 'y'"),
     "targets": ({"targets": [[0.0, 0.0]]}, "targets: expected numbers, any × 3"),
     "targets of nothing": ({"targets": [[0.0, 0.0, float("nan")]]}, "targets: expected finite numbers"),
-    "noise": ({"noise": {"measurement": 1.0}}, r"noise\.source: .*no key 'source'"),
+    "noise": ({"noise": {"sigma": 1.0}}, r"noise\.source: .*no key 'source'"),
     "noise of words": ({"noise": 3}, "noise: .*got int"),
     "verdict": (
         {"verdict": {"level": "PASS", "reasons": [{"level": "PASS"}]}},
         r"reasons\[0\]\.code: .*no key",
     ),
     "verdict of words": ({"verdict": "PASS"}, "verdict: .*got str"),
-    "corrections": ({"joint_corrections": {"sines": []}}, r"joint_corrections\.parameters: .*no key"),
+    "error model": ({"error_model": {"terms": []}}, r"error_model\.model: .*no key"),
     "kind": ({"format": "calib_planner/plan"}, "expected calib_planner/estimate"),
 }
 

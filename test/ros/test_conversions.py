@@ -188,6 +188,6 @@ def test_an_estimate_with_infinite_accuracy_travels(robot: Robot, planned: Plan)
     blind = replace(
         found,
         fit=replace(found.fit, std=np.full(4, np.nan)),
-        accuracy=replace(found.accuracy, parameters=np.array([np.inf])),
+        accuracy=replace(found.accuracy, predicted=np.array([np.inf])),
     )
     assert math.isinf(c.estimate_to_message(blind).predicted_accuracy[0])

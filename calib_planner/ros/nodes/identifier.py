@@ -28,7 +28,15 @@ from calib_planner import __version__
 from calib_planner.acquisition import Intake, Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.identification import Estimate
-from calib_planner.io import ACCEPTED, CLOCK_OFFSET, Record, UnavailableStore, calibrated_urdf, open_store
+from calib_planner.io import (
+    ACCEPTED,
+    CLOCK_OFFSET,
+    Record,
+    UnavailableStore,
+    calibrated_urdf,
+    open_store,
+    read_error_model,
+)
 from calib_planner.ros import session as saving
 from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
@@ -129,6 +137,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         if not chosen.store_folder:
             text = "the session is in memory only and lost with the node: set store_folder to keep it"
             self.get_logger().warning(text)
+        self._error_model = read_error_model(chosen.error_model)
         self._output = IdentifierOutput(self)
         self.undo_with(self._leave_session)
         self._begin_with_stored()
@@ -276,7 +285,15 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
     @property
     def _how(self) -> Matching:
         s = self.settings.value
-        return Matching(s.plan_tolerance, s.accept_unplanned, s.sigma, s.repeatability, s.most_measurements)
+        return Matching(
+            s.plan_tolerance,
+            s.accept_unplanned,
+            s.sigma,
+            s.repeatability,
+            s.most_measurements,
+            self._error_model,
+            s.accuracy_frame,
+        )
 
     def _handle(self, results: list[Standstill | Rejection]) -> None:
         session, intake = self._session, self._intake
