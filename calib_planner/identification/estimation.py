@@ -133,7 +133,7 @@ class Origin:
     Attributes:
         model: The model before scales were estimated and terms went.
         data: The measurements, joints in the robot's order.
-        robust: Whether impossible points lose weight.
+        robust: Whether impossible points lose weight; default: with every model but the paper's.
         shifted: (N, targets) D of the points of a run of visits that is shifted [m²].
         coefficients: (coefficients,) β of the fit.
         scales: Names of the scales that were estimated, and the covariance of their logarithms.
@@ -364,7 +364,7 @@ def fit_error_model(
     data: Measurements,
     model: ErrorModel,
     *,
-    robust: bool = True,
+    robust: bool | None = None,
     choose: bool = True,
     start: ModelEstimate | None = None,
 ) -> ModelEstimate:
@@ -375,7 +375,7 @@ def fit_error_model(
         data: The measurements; the joint order may differ from the robot's. Where they hold payloads and the
             elastic term knows none, it gets one at the tip.
         model: The terms, with their scales before the data.
-        robust: Whether impossible points lose weight; never with the paper's model.
+        robust: Whether impossible points lose weight.
         choose: Whether terms that do not better the left-out score go.
         start: An estimate of the same robot and model from most of these data, to be brought up to date: quick,
             with its scales and terms. A full fit is made where ``start`` does not do, see ``_updated``.
@@ -384,7 +384,8 @@ def fit_error_model(
         NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
     """
     data = data.in_order_of(robot.joint_names)
-    robust, choose = robust and not model.is_papers, choose and not model.is_papers
+    robust = not model.is_papers if robust is None else robust
+    choose = choose and not model.is_papers
     quick = None
     if start is not None:
         with suppress(np.linalg.LinAlgError):

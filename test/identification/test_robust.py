@@ -8,7 +8,7 @@ from cells import SIGMA, TARGETS, bare, placed_cell, plain_cell, rejected, spoil
 from robots import random_configurations, repeats
 from scipy.stats import binom, chi2
 
-from calib_planner import IdentificationProblem, NotEnoughDataError, Robot, identify
+from calib_planner import IdentificationProblem, Measurements, NotEnoughDataError, Robot, identify
 from calib_planner.error_model import ErrorModel
 from calib_planner.identification.doubt import gate_of
 from calib_planner.identification.registration import register
@@ -200,3 +200,20 @@ def test_few_configurations_round_one_posture(seed):
     estimate = identify(IdentificationProblem(robot, bare(clean, p), sigma=7e-6, loss="robust"))
     assert {(row, 0) for row in rows.tolist()} <= rejected(estimate)
     assert len(rejected(estimate)) <= 3
+
+
+@pytest.mark.parametrize("sigma", [3e-5, None])
+@pytest.mark.parametrize("seed", range(3))
+def test_plain_least_squares_is_robust_if_that_is_wanted(seed: int, sigma: float | None) -> None:
+    robot, rng = Robot.load("kuka_kr270"), np.random.default_rng(seed)
+    q = rng.uniform(*robot.joint_limits.T, (40, 6))
+    points = robot.with_deviations({"q2": 1e-3, "d3": 1e-3}).positions(q) + 3e-5 * rng.standard_normal((40, 1, 3))
+    points[[3, 9, 20]] += np.array([5e-3, -2e-3, 1e-2])[:, None, None]
+    data = Measurements(robot.joint_names, q, points)
+    plain, robust = (
+        identify(IdentificationProblem(robot, data, sigma, ErrorModel.paper(), loss=loss))
+        for loss in ("auto", "robust")
+    )
+    assert not plain.points.rejected and plain.residuals.sigma > 1e-3
+    assert {3, 9, 20} <= {p.row for p in robust.points.rejected} and len(robust.points.rejected) <= 4
+    assert robust.residuals.sigma < 4e-5

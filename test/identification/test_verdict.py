@@ -14,6 +14,7 @@ from scipy.stats import binom
 from calib_planner import IdentificationProblem, Measurements, Robot, identify, validate
 from calib_planner.error_model import ErrorModel, Truth, typical
 from calib_planner.identification import LEVELS, RULES, judged
+from calib_planner.identification.alternatives import TABLE
 from calib_planner.measurements import RejectedPoint
 from calib_planner.simulation import SimulatedCell
 from calib_planner.tracker import Isotropic
@@ -180,9 +181,15 @@ USUAL = {"predicted_and_achieved", "correlated", "nearly_dependent", "left_out",
 
 
 def test_the_table_is_complete():
-    """Every code that the verdict can give is provoked below, at every level that it can have there."""
-    assert {rule.code for rule in RULES.values()} == set(PROVOKED)
-    assert all(key.partition(": ")[0] == rule.code for key, rule in RULES.items())
+    """Every code that the verdict can give is provoked below, at every level that it can have there.
+
+    Those of the alternatives are provoked one by one in test_alternatives.
+    """
+    assert {rule.code for rule in RULES.values()} - set(TABLE) == set(PROVOKED)
+    of_alternatives = {key.removeprefix("alternative: ") for key in RULES if key.startswith("alternative: ")}
+    assert of_alternatives == set(TABLE) and {"ratio", "push"} <= of_alternatives
+    others = {key: rule for key, rule in RULES.items() if not key.startswith("alternative: ")}
+    assert all(key.partition(": ")[0] == rule.code for key, rule in others.items())
     levels = {code: {rule_level for rule in RULES.values() if rule.code == code for rule_level in rule.advice}
               for code in PROVOKED}  # fmt: skip
     for code, ways in PROVOKED.items():
