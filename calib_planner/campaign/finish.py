@@ -136,7 +136,7 @@ def _reasons(state: CampaignState, known: Assessment) -> list[Reason]:
     if at_test_poses is not None and state.problem.accuracy_frame == "world":
         reasons.append(_achieved(estimate, state.problem.required_accuracy, at_test_poses))
     told = estimate.validation
-    if held_out is not None and told is not None and improbable(estimate, held_out):
+    if held_out is not None and told is not None and contradicted(estimate, held_out):
         achieved, predicted = length(told.rms), length(told.predicted_rms)
         reasons.append(RULES["contradicted"].reason(achieved=achieved, predicted=predicted))
     return reasons + list(estimate.verdict.reasons)
@@ -234,7 +234,7 @@ def _farthest(candidates: FloatArray, taken: FloatArray, scale: FloatArray, coun
     return candidates[rows]
 
 
-def improbable(estimate: Estimate, held_out: Measurements) -> bool:
+def contradicted(estimate: Estimate, held_out: Measurements) -> bool:
     """Whether held-out measurements are improbably far from where the estimate expects them, all together."""
     known, use = estimate.knowledge, np.repeat(held_out.seen, 3, axis=1)
     poses = known.poses(held_out.q, held_out.payload)

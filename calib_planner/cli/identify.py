@@ -78,7 +78,7 @@ def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "identify", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
-    add_parameters(parser, "what the points tell; none: both are as the robot and --targets say")
+    add_parameters(parser, "told by the points; none: both are as the robot and --targets say")
     add_data(parser)
     add_noise(parser)
     add_gravity(parser)

@@ -8,11 +8,11 @@ Which points to believe is decided by all measurements together, every time one 
 the others put it): later measurements may show that a point was no outlier. What changes is published and stored,
 nothing is deleted.
 
-While a plan is being measured the estimate before is brought up to date (``identify`` with a start), in
-milliseconds and with the sizes of the errors that the last full fit gave; when the visits have grown by a quarter
-a full fit is made anew. Once a plan is complete, for files and after a restart it is always a full fit, which
-depends on the measurements in use and on nothing else. So what is published of a complete plan and what is saved
-are the same after a restart; what is published in between may differ by a fraction of its standard deviations.
+A full fit depends on the measurements in use and on nothing else, so that it is the same after a restart. It is
+made of few measurements, once a plan is complete, and for files. In between, while a long plan is being measured,
+the estimate before is brought up to date (``identify`` with a start), in milliseconds and with the sizes of the
+errors that the last full fit gave; when the visits have grown by a quarter a full fit is made anew. What is
+published then may differ from the full fit, which a restart makes, by a fraction of its standard deviations.
 
 Files are saved in the folder that the user chose and nowhere else. Their names are made of the plan's name, which
 comes over the wire: only letters, digits, ``-`` and ``_`` of it become part of a file name, with a hash where
@@ -57,6 +57,8 @@ from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.units import brief, cut, listed
 
+UPDATED_FROM = 40
+"""Measurements from which on an estimate is brought up to date: a full fit of fewer takes some 0.1 s."""
 MOST_REJECTIONS = 10_000
 """Rejected standstills of a session that are stored; more are only counted, so that nobody fills the disk."""
 
@@ -310,8 +312,9 @@ class Session:
         )
 
     def estimate(self, how: Matching, *, settled: bool = False) -> Estimate | TooFew:
-        """Identify with the measurements in use; in full if ``settled`` or once the plan is complete."""
-        start = None if settled or self.complete else self._start
+        """Identify with the measurements in use: in full if ``settled``, from few, and for a complete plan."""
+        full = settled or self.complete or len(self.records) < UPDATED_FROM
+        start = None if full else self._start
         try:
             self.newest = self._start = identify(self.problem(how), start)
             self.settled = start is None

@@ -13,6 +13,7 @@ from calib_planner.ros.parameters import LATCHED
 
 NAME = "calibration_campaign"
 ASKED = {
+    "error_model": "paper",  # the simulated robots err in their parameters alone
     "robot": "planar_2r",
     "test_poses": "0.17 0.87",
     "required_accuracy": 5e-6,
