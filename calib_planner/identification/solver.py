@@ -355,10 +355,16 @@ def _freedom_left_out(left: LeftOut, fit: ModelEstimate) -> float:
 
 
 def _spare(fit: ModelEstimate) -> float:
-    """Measured coordinates less those that the fit has used up, tr(R P): n − p for plain least squares."""
-    linear = fit.solution.problem
+    """Coordinates of the points at different configurations less those that the fit has used up, p = n − tr(R P).
+
+    Repetitions tell the noise, and nothing of whether the model holds elsewhere.
+    """
+    linear, groups = fit.solution.problem, fit.left_out.groups
     shares = np.einsum("nij,nji->ni", linear.covariance, fit.solution.blocks) * linear.seen
-    return float(np.clip(shares, 0.0, 1.0).sum())
+    used = linear.seen.sum() - np.clip(shares, 0.0, 1.0).sum()
+    different = np.zeros((int(groups.max()) + 1, linear.seen.shape[1]))
+    np.maximum.at(different, groups, linear.seen)
+    return max(float(different.sum() - used), 0.0)
 
 
 def _variances(part: FloatArray, use: BoolArray) -> FloatArray:

@@ -49,6 +49,12 @@ def shaken(points: np.ndarray, size: float) -> np.ndarray:
     return points + size * np.random.default_rng(5).standard_normal(points.shape)
 
 
+def repeated(data, times: int):
+    """The same configurations again and again: that tells the noise alone."""
+    q, p = (np.repeat(a, times, axis=0) for a in (data.q, data.p))
+    return Measurements(KUKA.joint_names, q, shaken(p, SIGMA / 10))
+
+
 def one_joint(**options):
     q = np.repeat(random_configurations(KUKA, 1, 5), 15, axis=0)
     q[:, 0] = np.linspace(-1, 1, 15)
@@ -129,7 +135,10 @@ PROVOKED = {
     "large_residuals": [("FAIL", lambda: plainly(bare(data_of(), shaken(data_of().p, 0.05))))],
     "explained_little": [("WARN", of_three_millimetres_as_many)],
     "no_gain": [("WARN", lambda: other_parameters(2e-4)), ("PASS", nothing_wrong)],
-    "too_few_measurements": [("WARN", lambda: plainly(data_of(count=4)))],
+    "too_few_measurements": [
+        ("WARN", lambda: plainly(data_of(count=4))),
+        ("WARN", lambda: plainly(repeated(data_of(count=4), 5))),
+    ],
     "copies": [("WARN", copied)],
     "rejected": [
         ("PASS", lambda: spoilt(0.02)),
