@@ -104,7 +104,7 @@ def test_the_estimate_does_not_see_the_outlier() -> None:
     measure(dirty, *(seen(k, 1e-2 if k == 4 else 0.0) for k in rows))
     a, b = clean.newest, dirty.newest
     assert isinstance(a, Estimate) and isinstance(b, Estimate)
-    # An impossible point keeps the weight of an error of its own size, next to nothing; scales settle to a percent.
+    # An impossible point keeps the weight of an error of its own size; scales settle to a percent.
     assert (np.abs(a.fit.values - b.fit.values) < 1e-2 * a.fit.std).all()
     assert a.points.used == b.points.used == 9
     assert condition_of(a) == pytest.approx(condition_of(b), rel=1e-3) and condition_of(a) > 1
