@@ -92,12 +92,12 @@ def _identify(
         hidden = _hidden(problem.model, robot, poses.jacobian[rows])
         fit = _fit(problem, robot, hidden)
     check_count(problem, problem.data.seen & (fit.doubt == 0.0))
-    found: tuple[Alternative, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
     if mistake is not None:
-        found = (mistake,)
+        alternatives = (mistake,)
     elif start is None and fit.converged and not problem.model.is_papers:
-        found = find_alternatives(robot, problem.data, fit, problem.test_pose_array, problem.accuracy_frame)
-    return _estimate(problem, fit, hidden, found, robot, began)
+        alternatives = find_alternatives(robot, problem.data, fit, problem.test_pose_array, problem.accuracy_frame)
+    return _estimate(problem, fit, hidden, alternatives, robot, began)
 
 
 # ── before the fit ───────────────────────────────────────────────────────────────────────────────────
@@ -246,7 +246,7 @@ def _estimate(
     problem: IdentificationProblem,
     fit: ModelEstimate,
     hidden: Identifiability,
-    found: tuple[Alternative, ...],
+    alternatives: tuple[Alternative, ...],
     start: Robot,
     began: float,
 ) -> Estimate:
@@ -319,7 +319,7 @@ def _estimate(
         left_out=_left_out_error(fit.left_out, fit, source),
         placement_alone=_left_out_error(alone.left_out, fit, source),
         terms=fit.terms,
-        alternatives=found,
+        alternatives=alternatives,
         seconds=time.perf_counter() - began,
         model_fit=fit,
     )
