@@ -189,8 +189,8 @@ class Residuals:
         after: Of the points used, with all that was identified.
         placement_alone: Of the points used, from where ``Estimate.calibrated`` has them.
         sigma: Scatter of one coordinate about the fit [m], NaN without redundancy.
-        spare: Coordinates of the points at different configurations less those that the fit has used up: what
-            is left to judge it by.
+        spare: Coordinates of the points at different configurations, less the parameters that the data
+            determine: what is left to judge the fit by.
         chi_square: Whether measurement noise alone explains them.
     """
 
