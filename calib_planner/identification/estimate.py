@@ -319,11 +319,12 @@ def chance_of(freedom: float) -> float:
     """Factor by which a root mean square exceeds its expectation by chance once in a hundred (``CHANCE``).
 
     Args:
-        freedom: Degrees of freedom of the mean square, as a χ²; infinite: it is what is expected.
+        freedom: Degrees of freedom of the mean square, as a χ²; infinite: it is what is expected. With less than
+            one chance explains everything.
     """
     if not np.isfinite(freedom):
         return 1.0
-    return float(np.sqrt(chdtri(freedom, CHANCE) / freedom)) if freedom > 0.0 else float("inf")
+    return float(np.sqrt(chdtri(freedom, CHANCE) / freedom)) if freedom >= 1.0 else float("inf")
 
 
 @dataclass(frozen=True)
