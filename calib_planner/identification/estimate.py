@@ -189,7 +189,8 @@ class Residuals:
         after: Of the points used, with all that was identified.
         placement_alone: Of the points used, from where ``Estimate.calibrated`` has them.
         sigma: Scatter of one coordinate about the fit [m], NaN without redundancy.
-        spare: Measured coordinates less those that the fit has used up: what is left to judge it by.
+        spare: Coordinates of the points at different configurations, less the parameters that the data
+            determine: what is left to judge the fit by.
         chi_square: Whether measurement noise alone explains them.
     """
 
@@ -318,11 +319,12 @@ def chance_of(freedom: float) -> float:
     """Factor by which a root mean square exceeds its expectation by chance once in a hundred (``CHANCE``).
 
     Args:
-        freedom: Degrees of freedom of the mean square, as a χ²; infinite: it is what is expected.
+        freedom: Degrees of freedom of the mean square, as a χ²; infinite: it is what is expected. With less than
+            one chance explains everything.
     """
     if not np.isfinite(freedom):
         return 1.0
-    return float(np.sqrt(chdtri(freedom, CHANCE) / freedom)) if freedom > 0.0 else float("inf")
+    return float(np.sqrt(chdtri(freedom, CHANCE) / freedom)) if freedom >= 1.0 else float("inf")
 
 
 @dataclass(frozen=True)

@@ -96,8 +96,8 @@ def _identify(
     if mistake is not None:
         alternatives = (mistake,)
     elif start is None and fit.converged and not problem.model.is_papers:
-        where = problem.test_pose_array, problem.accuracy_frame
-        alternatives = find_alternatives(robot, problem.data, fit, *where)
+        at, frame = problem.test_pose_array, problem.accuracy_frame
+        alternatives = find_alternatives(robot, problem.data, fit, at, frame)
     return _estimate(problem, fit, hidden, alternatives, robot, began)
 
 
@@ -356,10 +356,17 @@ def _freedom_left_out(left: LeftOut, fit: ModelEstimate) -> float:
 
 
 def _spare(fit: ModelEstimate) -> float:
-    """Measured coordinates less those that the fit has used up, tr(R P): n − p for plain least squares."""
-    linear = fit.solution.problem
-    shares = np.einsum("nij,nji->ni", linear.covariance, fit.solution.blocks) * linear.seen
-    return float(np.clip(shares, 0.0, 1.0).sum())
+    """Coordinates of the points at different configurations, less the parameters that the data determine.
+
+    Repetitions tell the noise, and nothing of whether the model holds elsewhere. Of a parameter the data
+    determine what they take off its prior variance, 1 − C_kk/σ_k²; all of one of which nothing was known.
+    """
+    linear, groups, known = fit.solution.problem, fit.left_out.groups, fit.knowledge
+    count = len(known.robot.parameter_names)
+    left = np.diag(known.covariance)[:count] / known.model.variances(known.robot)[:count]
+    different = np.zeros((int(groups.max()) + 1, linear.seen.shape[1]))
+    np.maximum.at(different, groups, linear.seen)
+    return max(float(different.sum() - np.sum(1.0 - np.clip(left, 0.0, 1.0))), 0.0)
 
 
 def _variances(part: FloatArray, use: BoolArray) -> FloatArray:

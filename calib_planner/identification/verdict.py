@@ -151,7 +151,7 @@ _TABLE: tuple[tuple[str, str, Mapping[str, str]], ...] = (
     ),
     (
         "too_few_measurements",
-        "too few measurements: the fit leaves {spare} of their coordinates to judge it by",
+        "too few configurations: the fit leaves {spare} of the coordinates measured there to judge it by",
         {"WARN": "measure more configurations than the parameters need, or ask for fewer parameters"},
     ),
     (

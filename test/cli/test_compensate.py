@@ -195,10 +195,10 @@ def test_the_true_robot_is_the_judge(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert (
             terms is None
             if more
-            else [t["name"] for t in terms["terms"] if t["kept"]][:2] == ["placement", "gravity"]
+            else [t["name"] for t in terms["terms"] if t["used"]][:2] == ["placement", "gravity"]
         )
     before = float(np.sqrt(np.mean(np.sum((truth.truth.positions(q) - wanted) ** 2, axis=2))))
-    assert before > 1e-3 and off["placement"] < 0.5 * before and off["all"] < 0.5 * off["placement"]
+    assert before > 1e-3 and off["placement"] < 0.8 * before and off["all"] < 0.2 * off["placement"], off
 
 
 def test_a_saved_estimate_as_a_robot(cell: dict[str, str]) -> None:

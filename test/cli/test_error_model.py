@@ -45,8 +45,8 @@ def test_keys_of_the_contract(run: Run, arm: tuple[str, ...], tmp_path: Path) ->
     assert 0.7 < left["predicted_rms"] / left["rms"] < 1.4
     terms = {t["name"]: t for t in result["error_model"]["terms"]}
     assert list(terms) == ["placement", "gravity", "smooth", "short", "visits", "points"]
-    assert all(t.keys() == {"name", "size", "std", "gain", "kept"} for t in terms.values())
-    assert not [n for n in ("gravity", "smooth", "short") if not terms[n]["kept"] and terms[n]["size"]]
+    assert all(t.keys() == {"name", "size", "std", "gain", "used"} for t in terms.values())
+    assert not [n for n in ("gravity", "smooth", "short") if not terms[n]["used"] and terms[n]["size"]]
     assert result["error_model"]["model"] == read_estimate(tmp_path / "e.yaml").document["error_model"]["model"]
     paper = run(*arm, "--error-model", "paper")
     assert [t["name"] for t in paper["error_model"]["terms"]] == ["placement", "points"]
@@ -89,7 +89,7 @@ def test_a_model_comes_from_a_file_or_an_estimate(run: Run, arm: tuple[str, ...]
     alone = run(*arm, "--error-model", tmp_path / "m.yaml")
     assert [p["value"] for p in alone["parameters"]] == [p["value"] for p in named["parameters"]]
     again = run(*arm, "--error-model", tmp_path / "e.yaml")
-    kept = [t["name"] for t in named["error_model"]["terms"] if t["kept"]]
+    kept = [t["name"] for t in named["error_model"]["terms"] if t["used"]]
     assert [t["name"] for t in again["error_model"]["terms"]] == kept
 
 
