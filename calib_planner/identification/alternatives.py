@@ -1185,9 +1185,7 @@ class _Gross:
         factors = {"radians": 1.0, "degrees": np.pi / 180.0, "too small": 180.0 / np.pi}
         for angle, factor in factors.items():
             q = np.where(self.turns, self.q * factor, self.q)
-            about = _spread(self.p) / max(_spread(self._tip(q)[1][:, None]), 1e-9)
-            if not about > 0.0:  # all points in one place have no unit
-                continue
+            about = max(_spread(self.p), 1e-9) / max(_spread(self._tip(q)[1][:, None]), 1e-9)
             free = self._left(self._change("", q, self.p / about, scale=True))
             for scale in self._scales(about, about * free.scale):
                 change = self._in_units(angle, scale, q)

@@ -47,6 +47,8 @@ BoolArray = NDArray[np.bool_]
 NOTHING_HIDDEN = Identifiability((), (), (), np.empty((0, 0)), ())
 BLIND = 1e-5
 """Least motion of a point that tells that a test pose feels what the data cannot see [m per unit]."""
+MOST_STEPS, STOOD = 10, 1e-9
+"""Most steps that fit base and targets to nominal kinematics, and a step that ends it [m | rad]."""
 WEAK = 1e-2
 """Directions of unit-length columns with less than this length are hardly seen."""
 
@@ -159,8 +161,16 @@ def place_nominal(problem: IdentificationProblem, start: Robot | None = None) ->
     if not names:
         return problem.robot
     robot = start_robot(problem.robot, problem.data, robust=problem.robust) if start is None else start
-    known = fit_error_model(replace(robot, parameter_names=tuple(names)), problem.data, ErrorModel.paper(1e-3))
-    return replace(known.knowledge.placed, parameter_names=robot.parameter_names)
+    data, free = problem.data, replace(robot, parameter_names=tuple(names))
+    deviations, use = np.zeros(len(names)), np.repeat(data.seen, 3, axis=1).ravel()
+    for _ in range(MOST_STEPS):
+        points, jacobian = free.positions_and_jacobian(data.q, deviations)
+        apart = np.where(data.seen[:, :, None], data.p - points, 0.0).ravel()
+        step = np.linalg.lstsq(jacobian.reshape(-1, len(names))[use], apart[use], rcond=None)[0]
+        deviations = deviations + step
+        if np.abs(step).max() < STOOD:
+            break
+    return robot.with_deviations(dict(zip(names, deviations.tolist(), strict=True)))
 
 
 # ── what cannot be seen ──────────────────────────────────────────────────────────────────────────────
