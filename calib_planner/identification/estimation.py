@@ -6,7 +6,7 @@
                   priors (``likelihood``); generalised least squares gives parameters and coefficients. Repeat.
     3. doubt      Where points or a run of visits are impossible beside the others, these lose their weight
                   (``doubt``).
-    4. terms      A term that does not better the left-out score goes (``left_out``).
+    4. terms      A term with which the left-out score is surely worse goes (``left_out``).
     5. all        Many points: 1 to 4 are done with some of the visits; all of them then better the scales, and
                   generalised least squares is done with all.
 
@@ -98,7 +98,7 @@ CHORDS = 8
 BENDS = 3e-2
 """Share of a point's standard deviation that kinematics and linearisation may differ by: it is not seen."""
 OPTIONAL = ("short", "smooth", "gravity")
-"""Terms that have to better the left-out score."""
+"""Terms that go if the left-out score is surely worse with them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,16 +343,21 @@ class _Work:
         return solution
 
     def choose_terms(self, solution: Solution) -> tuple[Solution, dict[str, float]]:
-        """Without the terms that do not better the left-out score; term → gain."""
+        """Without the terms with which the left-out score is worse by more than chance; term → gain.
+
+        Chance is one standard deviation of the sum, from the groups' differences: what few groups cannot tell stays,
+        since a robot that does not bend at all is not what the prior expects.
+        """
         gains: dict[str, float] = {}
         while True:
-            score = left_out(solution, self.groups).score
+            scores = left_out(solution, self.groups).scores
             trials = {t: maximise(_without(solution.problem, t), 6) for t in _optional(solution.problem.model)}
-            trial_gains = {t: score - left_out(trial, self.groups).score for t, trial in trials.items()}
-            gains |= trial_gains
-            if not trial_gains or min(trial_gains.values()) > 0.0:
+            differences = {t: scores - left_out(trial, self.groups).scores for t, trial in trials.items()}
+            gains |= {t: float(d.sum()) for t, d in differences.items()}
+            surely = {t: float(d.sum() + np.sqrt(len(d)) * d.std()) for t, d in differences.items()}
+            if not surely or min(surely.values()) > 0.0:
                 return solution, gains
-            worst = min(trial_gains, key=lambda t: trial_gains[t])
+            worst = min(surely, key=lambda t: surely[t])
             before = self.state
             solution = trials[worst]
             left = _place(before.model, solution.problem.model, self.robot)
@@ -376,7 +381,7 @@ def fit_error_model(
             elastic term knows none, it gets one at the tip.
         model: The terms, with their scales before the data.
         robust: Whether impossible points lose weight.
-        choose: Whether terms that do not better the left-out score go.
+        choose: Whether terms with which the left-out score is surely worse go.
         start: An estimate of the same robot and model from most of these data, to be brought up to date: quick,
             with its scales and terms. A full fit is made where ``start`` does not do, see ``_updated``.
 
@@ -717,7 +722,7 @@ def _some(data: Measurements) -> FloatArray | None:
 
 
 def _optional(model: ErrorModel) -> tuple[str, ...]:
-    """Terms of this model that have to better the left-out score."""
+    """Terms of this model that go if the left-out score is surely worse with them."""
     components = () if model.joint_functions is None else model.joint_functions.components
     there = (*components, *(("gravity",) if model.gravity is not None else ()))
     return tuple(t for t in OPTIONAL if t in there)

@@ -56,7 +56,7 @@ def term_gains(
         problem: The last linear problem, with the model that is left.
         coefficients: (coefficients,) β where it ended.
         covariance: (coefficients, coefficients) of β.
-        gains: Term → gain, of terms that had to better the left-out score.
+        gains: Term → gain, of terms that could have gone.
     """
     squares, variances = _squares(problem, coefficients), _variances(problem, covariance)
     points = max(float(problem.seen.sum()) / 3.0, 1.0)
