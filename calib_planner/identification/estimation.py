@@ -81,6 +81,8 @@ COMMON = 2.0
 """A shift of a run is that many times as large as its visits differ, or it is none."""
 LEAST = 1e-8
 """Predictions that move by less than this stand still [m]."""
+EXACT = 1e-3
+"""Share of these limits to which the paper's least squares goes, whose equations are to be met exactly."""
 STILL = 1e-3
 """Predictions that move by less than this share of a point's standard deviation stand still."""
 FALLS = 0.1
@@ -223,7 +225,8 @@ class _Work:
         self.state = replace(self.state, coefficients=old + step, model=problem.model)
         self.rounds += 1
         # In units of what stands still; the next change falls as this one fell beside the one before, or faster.
-        share = float((change / (STILL * std + LEAST)).max())
+        fine = EXACT if problem.model.is_papers else 1.0
+        share = float((change / (fine * (STILL * std + LEAST))).max())
         self.converged = share <= 1.0 or bool(share < FALLS * self.moved and share**2 <= self.moved)
         self.moved = share
         return self.converged or not step.any()
@@ -345,8 +348,8 @@ class _Work:
     def choose_terms(self, solution: Solution) -> tuple[Solution, dict[str, float]]:
         """Without the terms with which the left-out score is worse by more than chance; term → gain.
 
-        Chance is one standard deviation of the sum, from the groups' differences: what few groups cannot tell stays,
-        since a robot that does not bend at all is not what the prior expects.
+        Chance is one standard deviation of the sum, from the groups' differences: what few groups cannot tell
+        stays, since a robot that does not bend at all is not what the prior expects.
         """
         gains: dict[str, float] = {}
         while True:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from calib_planner.cli import main
 from calib_planner.cli.main import bind_negative
+from calib_planner.identification import solver
 
 PLAN = "plan --robot planar_2r --starts 2 --configurations"
 IDENTIFY = "identify --robot planar_2r --data"
@@ -74,11 +76,7 @@ CASES = {
     "loss": (f"{IDENTIFY} good.csv --loss square", 2, ["--loss", "linear"]),
     "sigma and instrument": (f"{IDENTIFY} good.csv --sigma 1 --instrument x", 2, ["not allowed with"]),
     "sigma of data": (f"{IDENTIFY} good.csv --sigma 0", 2, ["sigma", "(0, inf] m"]),
-    "more folds than data": (f"{IDENTIFY} good.csv --folds 4", 2, ["folds", "from 2 to 3", "got 4"]),
-    "one fold": (f"{IDENTIFY} good.csv --folds 1", 2, ["folds", "from 2"]),
-    "starts": (f"{IDENTIFY} good.csv --starts -1", 2, ["starts", "from 0"]),
     "required accuracy": (f"{IDENTIFY} good.csv --required-accuracy nan", 2, ["required_accuracy", "nan"]),
-    "discrepancy": (f"{IDENTIFY} good.csv --discrepancy on", 2, ["--discrepancy", "auto"]),
     "file twice": (f"{IDENTIFY} good.csv --data ./good.csv", 2, ["--data", "good.csv again", "no measurement"]),
     "fitted and held out": (f"{IDENTIFY} good.csv --validate good.csv", 2, ["--validate", "proves nothing"]),
     "prior includes": (f"{IDENTIFY} good.csv --prior-includes tool", 2, ["--prior-includes", "an estimate"]),
@@ -97,9 +95,20 @@ CASES = {
     "cell": (f"{IDENTIFY} word.csv", 1, ["word.csv", "line 2, column q2", "'zero'", "finite number"]),
     "NaN in a cell": (f"{IDENTIFY} nan.csv", 1, ["nan.csv", "line 2, column q2", "'nan'"]),
     "joint name": (f"{IDENTIFY} joints.csv", 1, ["no column q2", "q1, q3", "rename or add them"]),
-    "too few points": (f"{IDENTIFY} one_row.csv", 1, ["3 equations for 4 parameters", "at least 2"]),
+    "options of old": (f"{IDENTIFY} good.csv --folds 4", 2, ["unrecognized arguments", "--folds"]),
+    "error model": (f"{IDENTIFY} good.csv --error-model nowhere.yaml", 1, ["nowhere.yaml"]),
+    "accuracy frame": (f"{IDENTIFY} good.csv --accuracy-frame tool", 2, ["--accuracy-frame", "world", "robot"]),
+    "too few points": (
+        f"{IDENTIFY} one_row.csv --error-model paper",
+        1,
+        ["3 equations for 4 parameters", "at least 2"],
+    ),
     "nothing measured": (f"{IDENTIFY} unseen.csv", 1, ["no measured points"]),
-    "targets of the data": (f"{IDENTIFY} two.csv", 1, ["2 targets", "--targets", "--unknown tool"]),
+    "targets of the data": (
+        f"{IDENTIFY} two.csv --unknown none",
+        1,
+        ["2 targets", "--targets", "--unknown tool"],
+    ),
     "validation of other targets": (
         f"{IDENTIFY} good.csv --validate two.csv",
         1,
@@ -110,8 +119,12 @@ CASES = {
         1,
         ["at least 4 configurations", "several joints"],
     ),
-    "millimetres": (f"{IDENTIFY} mm.csv", 1, ["mm.csv", "coordinates in metres", "--millimetres"]),
-    "metres as millimetres": (f"{IDENTIFY} good.csv --millimetres", 1, ["good.csv", "metres already"]),
+    "millimetres": (f"{IDENTIFY} mm.csv", 1, ["mm.csv", "metres and radians", "in millimetres", "--millimetres"]),
+    "metres as millimetres": (
+        f"{IDENTIFY} good.csv --millimetres",
+        1,
+        ["good.csv", "too close together", "leave out --millimetres"],
+    ),
     "infinity in a cell": (f"{IDENTIFY} inf.csv", 1, ["inf.csv", "line 2, column x1", "'inf'"]),
     "empty file": (f"{IDENTIFY} empty.csv", 1, ["empty.csv", "an empty file", "column names"]),
     "header only": (f"{IDENTIFY} header.csv", 1, ["header.csv", "a header only"]),
@@ -127,7 +140,6 @@ CASES = {
     "prior with tags": (f"{IDENTIFY} good.csv --prior tags.yaml", 1, ["tags.yaml", "YAML", "prior knowledge"]),
     "prior that is a plan": (f"{IDENTIFY} good.csv --prior plan.yaml", 1, ["plan.yaml", "format"]),
     "no such instrument": (f"{IDENTIFY} good.csv --instrument none.yaml", 1, ["none.yaml"]),
-    "folds of too little": (f"{IDENTIFY} two_rows.csv --folds 2", 1, ["--folds 2", "too little", "3 equations"]),
     "validation too short": (
         f"{IDENTIFY} good.csv --validate one_row.csv --validate-target-from 1",
         1,
@@ -159,11 +171,13 @@ def test_bad_input(
 
 
 def test_an_estimate_that_does_not_settle_is_no_success(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, output = tmp_path / "good.csv", tmp_path / "estimate.yaml"
     path.write_text(FILES["good.csv"])
-    words = f"{IDENTIFY} {path} --iterations 1 --output {output}"
+    settled = solver._fit
+    monkeypatch.setattr(solver, "_fit", lambda *a: replace(settled(*a), converged=False))
+    words = f"{IDENTIFY} {path} --output {output}"
     assert main(words.split()) == 1
     out, err = capsys.readouterr()
     assert (

@@ -108,7 +108,7 @@ def test_compensate_uses_the_mean(run: Run, arm: tuple[str, ...], tmp_path: Path
     }
     nominal = mixed()
     known = read_estimate(tmp_path / "e.yaml").knowledge(nominal)
-    (tool,) = np.array(read_estimate(tmp_path / "e.yaml").targets)[:1]
+    (tool,) = known.placed.target_offsets[:1]
     wanted = nominal.with_base(np.eye(3), np.zeros(3)).with_targets([tool]).positions(q)[:, 0]
     points = known.poses(np.array(results[0]["corrected"])).points[:, 0]
     turn, place = known.poses(q).robot.base_pose

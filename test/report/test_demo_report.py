@@ -12,6 +12,7 @@ from rich.console import Console
 
 from calib_planner import IdentificationProblem, PlanProblem, Robot, identify, plan
 from calib_planner.demo import DemoResult, demo_report, draw, print_table
+from calib_planner.error_model import ErrorModel
 from calib_planner.errors import InputError
 from calib_planner.planning import Search
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -24,7 +25,7 @@ def result() -> DemoResult:
     made = plan(problem)
     cell = SimulatedCell(robot, random_deviations(robot, 2), problem.instrument.typical)
     data = cell.measure(made.configurations, 1, 2)
-    estimate = identify(IdentificationProblem(robot, data, sigma=problem.instrument.typical))
+    estimate = identify(IdentificationProblem(robot, data, problem.instrument.typical, ErrorModel.paper()))
     with pytest.raises(InputError, match="estimate"):
         demo_report(
             PlanProblem(robot.with_parameters("full"), [0.3, 0.5], 6),
