@@ -65,10 +65,10 @@ By hand: run it, measure what it says (--next FILE), run it again with all that 
 when it asks for validation, measure that into a file of its own (--held-out FILE). In simulation: --simulate
 SEED."""
 EXAMPLE = """calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
-      --required-accuracy 15e-6 --budget 40 --simulate 1
+      --required-accuracy 3e-4 --budget 40 --simulate 1
   calib-planner campaign --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
-      --required-accuracy 15e-6 --measured points.csv --next next.csv"""
-SIMULATED = "paper"
+      --required-accuracy 3e-4 --measured points.csv --next next.csv"""
+SIMULATED = "typical"
 """How the simulated robot of a campaign errs besides its parameters, where nothing else is said."""
 DEFAULTS = {name: field.default for name, field in CampaignProblem.__dataclass_fields__.items()}
 NUMBERS = {
