@@ -6,8 +6,10 @@ A simulated UR10e that errs in all ways that the typical error model knows, with
 unknown, one target and three. An update starts at the estimate of the visits before and brings one more in
 (``fit_error_model(..., start=…)``). Milliseconds of one core: the *median* and the *slowest* of the updates but
 the first, which changes the form of the solution (*first*); an *undo* withdraws a visit from the middle; *full*
-is a full fit. *apart* is the root mean square by which predictions at 100 other configurations differ from those
-of the full fit, as a share of what the full fit says of their uncertainty. JSON on stdout.
+is a full fit. *identify* is the median of ``identify(problem, start=…)`` as a whole, with ten test poses, of the
+same updates, and *its first* the first of them. *apart* is the root mean square by which predictions at 100 other
+configurations differ from those of the full fit, as a share of what the full fit says of their uncertainty. JSON
+on stdout.
 """
 
 from __future__ import annotations
@@ -17,20 +19,23 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from calib_planner import Robot
 from calib_planner.error_model import Truth, typical
-from calib_planner.identification import ModelEstimate, fit_error_model
+from calib_planner.identification import IdentificationProblem, fit_error_model, identify
 from calib_planner.measurements import Measurements
 
 TARGETS = [[0.0, 0.05, 0.1], [0.08, -0.03, 0.05], [-0.04, 0.02, 0.12]]
 OTHERS = 100
 """Configurations at which predictions are compared."""
+TEST_POSES = 10
+T = TypeVar("T")
 
 
 def simulate(count: int, targets: int) -> tuple[Robot, Measurements]:
@@ -44,8 +49,8 @@ def simulate(count: int, targets: int) -> tuple[Robot, Measurements]:
     return robot.with_parameters("full", ("base", "tool")), Measurements(robot.joint_names, q, points)
 
 
-def timed(job: Callable[[], ModelEstimate]) -> tuple[ModelEstimate, float]:
-    """The estimate, and milliseconds of the processor."""
+def timed(job: Callable[[], T]) -> tuple[T, float]:
+    """What the job returns, and milliseconds of the processor."""
     began = time.process_time()
     found = job()
     return found, 1e3 * (time.process_time() - began)
@@ -65,6 +70,12 @@ def measure(robot: Robot, data: Measurements, count: int, updates: int) -> dict[
     full, others = fit_error_model(robot, visits, model), data.q[-OTHERS:]
     told, expected = found.knowledge.predict(others), full.knowledge.predict(others)
     apart = np.sum((told.mean - expected.mean) ** 2, axis=2).mean()
+    asked = IdentificationProblem(robot, visits, test_poses=data.q[-TEST_POSES:])
+    estimate, complete = identify(replace(asked, data=visits.select(np.arange(count)))), []
+    for k in range(count + 1, count + updates + 1):
+        problem = replace(asked, data=visits.select(np.arange(k)))
+        estimate, spent = timed(partial(identify, problem, estimate))
+        complete.append(spent)
     return {
         "targets": data.p.shape[1],
         "visits": count,
@@ -73,6 +84,8 @@ def measure(robot: Robot, data: Measurements, count: int, updates: int) -> dict[
         "first": times[0],
         "undo": undone,
         "full": whole,
+        "identify": median(complete[1:]),
+        "its first": complete[0],
         "apart": float(np.sqrt(apart / np.trace(expected.position, axis1=2, axis2=3).mean())),
     }
 

@@ -213,10 +213,13 @@ class Knowledge:
             return own
         scale = np.sqrt(np.maximum(np.diag(self.covariance)[count:], 0.0))
         scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-        rest = self.covariance[count:, count:] * np.outer(scale, scale)
+        rest = np.outer(scale, scale)
+        rest *= self.covariance[count:, count:]
         scaled = cross * scale
         with suppress(np.linalg.LinAlgError):  # a coefficient that is known has a row of zeros
-            root = np.linalg.cholesky(rest + ROUNDING * np.eye(len(rest)))
+            regular = rest.copy()
+            regular[np.diag_indices(len(rest))] += ROUNDING
+            root = np.linalg.cholesky(regular)
             white = solve_triangular(root, scaled.T, lower=True)
             return np.asarray(own - white.T @ white)
         return own - scaled @ np.linalg.pinv(rest, rcond=1e-12, hermitian=True) @ scaled.T
@@ -365,7 +368,7 @@ def error_variance(rows: FloatArray, inverse: FloatArray, hidden: FloatArray) ->
     """
     if hidden.size and np.abs(rows @ hidden).max() > FELT * np.abs(rows).max():
         return float("inf")
-    return max(float(np.einsum("ij,jk,ik->", rows, inverse, rows)), 0.0) / (len(rows) / 3)
+    return max(float(np.sum((rows @ inverse) * rows)), 0.0) / (len(rows) / 3)
 
 
 def without_rigid_motion(points: FloatArray, rows: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from scipy.special import chdtrc, chdtri
 from calib_planner.arrays import FloatArray, check_configurations, frozen, plain
 from calib_planner.error_model import Knowledge, to_mapping
 from calib_planner.identification.alternatives import Alternative
-from calib_planner.identification.estimation import ModelEstimate
+from calib_planner.identification.estimation import ModelEstimate, PlacementAlone
 from calib_planner.identification.term_gain import TermGain
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot
@@ -237,21 +237,30 @@ class Accuracy:
     Attributes:
         test_poses: (K, joints) [rad | m].
         predicted: (K,) error of ``Estimate.positions`` [m]; infinite where it rests on what the data cannot see.
-        parameters: (K,) what the uncertainty of the parameters has of it [m].
         placement: (K,) error of ``Estimate.calibrated`` [m]: what it lacks of the mean, and the uncertainty.
+        knowledge: What the prediction rests on.
         frame: ``world`` or ``robot``.
         required: Largest error at a pose that the user can live with [m]; NaN: not stated.
     """
 
     test_poses: FloatArray
     predicted: FloatArray
-    parameters: FloatArray
     placement: FloatArray
+    knowledge: Knowledge = field(repr=False)
     frame: str = "world"
     required: float = float("nan")
 
     def __post_init__(self) -> None:
-        _freeze(self, "test_poses", "predicted", "parameters", "placement")
+        _freeze(self, "test_poses", "predicted", "placement")
+
+    @cached_property
+    def parameters(self) -> FloatArray:
+        """(K,) what the uncertainty of the parameters has of ``predicted`` [m]."""
+        if not len(self.test_poses):
+            return np.empty(0)
+        told = np.trace(self.knowledge.predict(self.test_poses).parameters, axis1=2, axis2=3).mean(axis=1)
+        own = np.sqrt(np.maximum(told, 0.0))  # rounding
+        return frozen(np.where(np.isinf(self.predicted), np.inf, own))
 
     @property
     def overall(self) -> float:
@@ -430,6 +439,7 @@ class Estimate:
         validation: Statistics on held-out data, if any was given.
         verdict: PASS, WARN or FAIL with reasons, see ``verdict``.
         model_fit: The fit behind it, from which an update begins; ``None`` for an estimate that was read.
+        placement_fit: The same behind ``calibrated``.
     """
 
     calibrated: Robot
@@ -448,6 +458,7 @@ class Estimate:
     validation: Validation | None = None
     verdict: Verdict = UNJUDGED
     model_fit: ModelEstimate | None = field(default=None, repr=False)
+    placement_fit: PlacementAlone | None = field(default=None, repr=False)
 
     @property
     def scale_spread(self) -> dict[str, float]:

@@ -14,7 +14,7 @@ The paper's model has no scales and no terms to choose: what is left are its ste
 
 An estimate of most of the same measurements is a *start* (``fit_error_model``): its scales and terms are kept,
 and the few visits that came or went are brought in by (4), doubts included. The full fit is made all the same
-where that would not be good enough (``_updated``). What a full fit says depends on the data alone.
+where that would not be good enough (``update_error_model``). What a full fit says depends on the data alone.
 """
 
 from __future__ import annotations
@@ -386,7 +386,7 @@ def fit_error_model(
         robust: Whether impossible points lose weight.
         choose: Whether terms with which the left-out score is surely worse go.
         start: An estimate of the same robot and model from most of these data, to be brought up to date: quick,
-            with its scales and terms. A full fit is made where ``start`` does not do, see ``_updated``.
+            with its scales and terms. A full fit is made where it does not do, see ``update_error_model``.
 
     Raises:
         NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
@@ -394,10 +394,7 @@ def fit_error_model(
     data = data.in_order_of(robot.joint_names)
     robust = not model.is_papers if robust is None else robust
     choose = choose and not model.is_papers
-    quick = None
-    if start is not None:
-        with suppress(np.linalg.LinAlgError):
-            quick = _updated(robot, data, model, robust, start)
+    quick = None if start is None else update_error_model(robot, data, model, start, robust=robust)
     try:
         return _estimate(robot, data, model, robust, choose) if quick is None else quick
     except np.linalg.LinAlgError:
@@ -466,7 +463,9 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
 def _covariance(solution: Solution, scales: tuple[tuple[str, ...], FloatArray]) -> FloatArray:
     """(coefficients, coefficients) C of β, uncertain scales included, symmetric in all digits."""
     covariance = with_uncertain_scales(solution, scales)
-    return 0.5 * (covariance + covariance.T)
+    symmetric = covariance + covariance.T
+    symmetric *= 0.5
+    return symmetric
 
 
 def _knowledge(work: _Work, covariance: FloatArray, hidden: FloatArray) -> Knowledge:
@@ -506,11 +505,15 @@ class PlacementAlone:
     converged: bool
 
 
-def placement_alone(fit: ModelEstimate) -> PlacementAlone:
+def placement_alone(fit: ModelEstimate, start: PlacementAlone | None = None) -> PlacementAlone:
     """The parameters that predict best where gravity and joint functions are nobody's business.
 
     They are not those of the whole model: they take over what they can of the terms that are off. What they
     cannot has to be in visits and points, whose scales are estimated anew. Points that were doubted stay so.
+
+    Args:
+        fit: Of the whole model.
+        start: The same of the fit that ``fit`` is an update of; its scales stay.
     """
     problem, origin = fit.solution.problem, fit.origin
     model, robot = problem.model, problem.robot
@@ -520,8 +523,13 @@ def placement_alone(fit: ModelEstimate) -> PlacementAlone:
     alone = replace(model, gravity=None, joint_functions=None)
     work = _Work(robot, origin.data, alone)
     count = len(robot.parameter_names)
-    work.state = _State(origin.coefficients[:count], alone, fit.doubt)
-    solution = work.settle(MOST_ROUNDS)
+    if start is None:
+        work.state = _State(origin.coefficients[:count], alone, fit.doubt)
+        solution = work.settle(MOST_ROUNDS)
+    else:
+        alone = alone.with_values(start.knowledge.model.values)
+        work.state = _State(start.knowledge.coefficients, alone, fit.doubt)
+        solution = work.settle(MOST_ROUNDS, 0)
     covariance = _covariance(solution, scale_covariance(solution))
     known = _knowledge(work, covariance, _hidden(solution.problem))
     return PlacementAlone(known, left_out(solution, work.groups), work.converged)
@@ -530,19 +538,30 @@ def placement_alone(fit: ModelEstimate) -> PlacementAlone:
 # ── an update ────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _updated(
-    robot: Robot,
-    data: Measurements,
-    model: ErrorModel,
-    robust: bool,
-    start: ModelEstimate,
+def update_error_model(
+    robot: Robot, data: Measurements, model: ErrorModel, start: ModelEstimate, *, robust: bool | None = None
 ) -> ModelEstimate | None:
     """``start`` brought up to date with the visits that came and went; ``None``: a full fit is needed.
 
-    That is so if ``start`` is of another robot or model, did not converge or left a direction hidden; if it has
-    no terms with scales (the paper's model: a full fit is as quick); if there are ``GROWN`` times as many visits
-    as the scales come from, or most of these went; if the first payload came; if the squared left-out residuals
-    changed by a factor of ``OFF``; or if a visit that went was the only one to tell something.
+    Arguments as of ``fit_error_model``. A full fit is needed if ``start`` is of another robot or model, did not
+    converge or left a direction hidden; if it has no terms with scales (the paper's model: a full fit is as
+    quick); if there are ``GROWN`` times as many visits as the scales come from, or most of these went; if the
+    first payload came; if the squared left-out residuals changed by a factor of ``OFF``; or if a visit that went
+    was the only one to tell something.
+    """
+    robust = not model.is_papers if robust is None else robust
+    with suppress(np.linalg.LinAlgError):
+        return _updated(robot, data.in_order_of(robot.joint_names), model, robust, start)
+    return None
+
+
+def _updated(
+    robot: Robot, data: Measurements, model: ErrorModel, robust: bool, start: ModelEstimate
+) -> ModelEstimate | None:
+    """The same for clean arguments.
+
+    Raises:
+        numpy.linalg.LinAlgError: A visit that went was the only one to tell something.
     """
     origin, old = start.origin, start.solution.problem
     placed = old.robot

@@ -377,9 +377,8 @@ def dense(problem: LinearProblem) -> DenseSolution:
     every = np.arange(n)
     total = scaled @ scaled.T
     total.reshape(n, m, n, m)[every, :, every, :] += problem.covariance
-    factor = np.linalg.cholesky(total)
-    half, _ = dpotri(factor, lower=1)
-    inverse = np.tril(half) + np.tril(half, -1).T
+    factor = np.asarray(np.linalg.cholesky(total), np.float64)
+    inverse = _inverse_of(factor)
     carried = inverse @ flat
     normal = flat.T @ carried
     spread = _inverse(normal)
@@ -441,14 +440,17 @@ def updatable(solution: Solution) -> UpdatedSolution:
     problem = solution.problem
     n, m = problem.y.shape
     rows = np.hstack([problem.flat_columns, problem.scaled_columns])
-    precision = np.asarray(np.linalg.inv(problem.covariance), np.float64)
-    normal = rows.T @ (precision @ rows.reshape(n, m, -1)).reshape(n * m, -1)
+    whitening = np.linalg.inv(np.linalg.cholesky(problem.covariance))
+    precision = np.asarray(whitening.transpose(0, 2, 1) @ whitening, np.float64)
+    white = (whitening @ rows.reshape(n, m, -1)).reshape(n * m, -1)
+    normal = white.T @ white
     rank = problem.flat_columns.shape[1]
     normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
-    inverse = _inverse(normal)
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    factor = np.linalg.cholesky(normal * np.outer(scale, scale))
+    inverse = _inverse_of(factor) * np.outer(scale, scale)
     spread = (rows @ inverse).reshape(n, m, -1) @ rows.reshape(n, m, -1).transpose(0, 2, 1)
-    scale = np.sqrt(np.diag(normal))
-    logarithm = 2.0 * np.log(scale).sum() + float(np.linalg.slogdet(normal / np.outer(scale, scale))[1])
+    logarithm = 2.0 * float((np.log(np.diag(factor)) - np.log(scale)).sum())
     return _finished(problem, rows, precision, inverse, logarithm, spread)
 
 
@@ -565,6 +567,12 @@ def _finished(
     )
 
 
+def _inverse_of(factor: FloatArray) -> FloatArray:
+    """Of L Lᵀ, from the lower triangle L."""
+    half, _ = dpotri(factor, lower=1)
+    return np.asarray(np.tril(half) + np.tril(half, -1).T)
+
+
 def _inverse(matrix: FloatArray) -> FloatArray:
     """Of a positive definite matrix, scaled to unit diagonal first."""
     if not len(matrix):
@@ -635,7 +643,8 @@ def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], Flo
         if name in problem.ratios:
             direct[problem.random, at] = problem.ratios[name] * solution.coefficients[problem.random]
     gradient = direct - solution.coefficients_of(_pushes(solution, names))
-    return np.asarray(result + gradient @ covariance @ gradient.T)
+    result += gradient @ covariance @ gradient.T
+    return result
 
 
 def scale_covariance(solution: Solution) -> tuple[tuple[str, ...], FloatArray]:

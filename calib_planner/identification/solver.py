@@ -6,6 +6,10 @@
 3. fit        Parameters, all other coefficients and the scales of the error model (``estimation``).
 4. alone      The same without gravity and joint functions: what a URDF can hold.
 5. estimate   What the fit says, in the words of ``Estimate``, with its verdict.
+
+With a start, 1 to 4 are left out where the start can be brought up to date. Its scales and terms stay, and so do
+what one visit more or less hardly changes: the errors before calibration, and which combinations the data hardly
+see or the prior decides. The next full fit finds them anew.
 """
 
 from __future__ import annotations
@@ -31,9 +35,15 @@ from calib_planner.identification.estimate import (
     PointNoise,
     Points,
     Residuals,
+    ResidualStatistics,
     residual_statistics,
 )
-from calib_planner.identification.estimation import ModelEstimate, fit_error_model, placement_alone
+from calib_planner.identification.estimation import (
+    ModelEstimate,
+    fit_error_model,
+    placement_alone,
+    update_error_model,
+)
 from calib_planner.identification.left_out import LeftOut
 from calib_planner.identification.problem import IdentificationProblem
 from calib_planner.identification.registration import register
@@ -61,6 +71,8 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
         problem: What is to be identified, from what.
         start: An estimate of the same robot by the same error model from most of these data, which is brought up
             to date at its own scales and terms: many times quicker. A full fit is made where that does not do.
+            ``residuals.before``, ``observability.resolved_by_prior`` and ``nearly_dependent`` of an update are
+            those of the start.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknown parameters, or most points disagree.
@@ -84,11 +96,14 @@ def _identify(
 ) -> Estimate:
     """The estimate without its verdict; ``mistake``: what is grossly wrong with the data."""
     check_count(problem, problem.data.seen)
+    updated = None if start is None else _updated(problem, start, began)
+    if updated is not None:
+        return updated
     robot = start_robot(problem.robot, problem.data, robust=problem.robust)
     # A fit may run so far along what it cannot see that it seems to see it: this is decided first at the start.
     rows = np.repeat(problem.data.seen, 3, axis=1)
     hidden = _hidden(problem.model, robot, robot.jacobian(problem.data.q)[rows])
-    fit = _fit(problem, robot, hidden, None if start is None else start.model_fit)
+    fit = _fit(problem, robot, hidden)
     if fit.knowledge.hidden.shape[1]:
         poses = fit.knowledge.poses(problem.data.q, problem.data.payload)
         hidden = _hidden(problem.model, robot, poses.jacobian[rows])
@@ -101,6 +116,23 @@ def _identify(
         at, frame = problem.test_pose_array, problem.accuracy_frame
         alternatives = find_alternatives(robot, problem.data, fit, at, frame)
     return _estimate(problem, fit, hidden, alternatives, robot, began)
+
+
+def _updated(problem: IdentificationProblem, start: Estimate, began: float) -> Estimate | None:
+    """``start`` brought up to date, without its verdict; ``None`` where a full fit is needed."""
+    before, hidden = start.model_fit, start.observability.fixed
+    if before is None or problem.robot.parameter_names != start.fit.parameters:
+        return None
+    seen = replace(problem.robot, parameter_names=before.solution.problem.robot.parameter_names)
+    fit = update_error_model(seen, problem.data, problem.model, before, robust=problem.robust)
+    if fit is None:
+        return None
+    robot, rows = start.knowledge.robot, np.repeat(problem.data.seen, 3, axis=1)
+    now = _hidden(problem.model, robot, robot.jacobian(problem.data.q)[rows])
+    if tuple(robot.parameter_names[i] for i in now.fixed) != hidden:
+        return None
+    check_count(problem, problem.data.seen & (fit.doubt == 0.0))
+    return _estimate(problem, fit, now, (), robot, began, start)
 
 
 # ── before the fit ───────────────────────────────────────────────────────────────────────────────────
@@ -228,17 +260,17 @@ def _blind_poses(problem: IdentificationProblem, robot: Robot, directions: Float
     return np.asarray((np.linalg.norm(felt, axis=1) > 10.0 * seen + BLIND).any(axis=1))
 
 
-def _fit(
-    problem: IdentificationProblem, robot: Robot, hidden: Identifiability, start: ModelEstimate | None = None
-) -> ModelEstimate:
+def _fit(problem: IdentificationProblem, robot: Robot, hidden: Identifiability) -> ModelEstimate:
     """The fit without one parameter of each hidden combination; these are in no part of it."""
     free = tuple(n for i, n in enumerate(robot.parameter_names) if i not in hidden.fixed)
     seen = replace(robot, parameter_names=free or robot.parameter_names)
-    return fit_error_model(seen, problem.data, problem.model, robust=problem.robust, start=start)
+    return fit_error_model(seen, problem.data, problem.model, robust=problem.robust)
 
 
 def _with_fixed(known: Knowledge, names: tuple[str, ...]) -> Knowledge:
     """With all parameters ``names``; those that it does not have are at their nominal values, without doubt."""
+    if known.robot.parameter_names == names:
+        return known
     robot = replace(known.robot, parameter_names=names)
     own = known.model.names(robot)
     place = [own.index(n) for n in known.model.names(known.robot)]
@@ -260,10 +292,12 @@ def _estimate(
     alternatives: tuple[Alternative, ...],
     start: Robot,
     began: float,
+    before: Estimate | None = None,
 ) -> Estimate:
-    """The answer, without its verdict."""
-    data, model, names = problem.data, problem.model, start.parameter_names
-    known, alone = _with_fixed(fit.knowledge, names), placement_alone(fit)
+    """The answer, without its verdict; ``before``: the estimate that ``fit`` is an update of."""
+    data, names = problem.data, start.parameter_names
+    known = _with_fixed(fit.knowledge, names)
+    alone = placement_alone(fit, None if before is None else before.placement_fit)
     seen, use = data.seen, data.seen & (fit.doubt == 0.0)
     deviations, covariance = known.coefficients[: len(names)], known.covariance[: len(names), : len(names)]
     std = np.sqrt(np.diag(covariance))
@@ -273,16 +307,19 @@ def _estimate(
     residuals = data.p - predicted
     normalised = np.where(seen, np.sqrt(squares_of_points(fit.solution, fit.doubt)[0]), np.nan)
     gate = float(np.sqrt(gate_of(int(seen.sum()))))
-    before = data.p - place_nominal(problem, start).positions(data.q)
     source = problem.noise_source
     linear, rank = fit.solution.problem, len(names) - len(hidden.fixed)
     flat, spare = linear.basis.shape[1], 3 * int(use.sum()) - rank
     chi = float(np.sum(linear.y * fit.solution.weighted))
     scatter = float(np.sqrt(np.sum(residuals[use] ** 2) / spare)) if spare > 0 else float("nan")
-    rows = start.jacobian(data.q)[np.repeat(seen, 3, axis=1)]
     off = _point_rows(problem, predicted, normalised, seen & ~use, gate)
     suspects = _point_rows(problem, predicted, normalised, use & (np.nan_to_num(normalised) > gate), gate)
     calibrated = _with_fixed(alone.knowledge, names).placed
+    if before is None:
+        sight = _observability(problem, start, covariance, hidden)
+        errors_before = _before(problem, start, use)
+    else:
+        sight, errors_before = before.observability, before.residuals.before
     return Estimate(
         calibrated=calibrated,
         knowledge=known,
@@ -296,14 +333,7 @@ def _estimate(
             iterations=fit.rounds,
             status=status,
         ),
-        observability=Observability(
-            rank=rank,
-            fixed=tuple(names[i] for i in hidden.fixed),
-            unidentifiable=hidden.combinations,
-            resolved_by_prior=_decided_by_prior(start, rows, hidden),
-            nearly_dependent=_hardly_seen(names, covariance, hidden.fixed),
-            prior=_prior_words(model),
-        ),
+        observability=sight,
         points=Points(
             measured=int(seen.sum()),
             used=int(use.sum()),
@@ -316,7 +346,7 @@ def _estimate(
             vectors=residuals,
             normalised=normalised,
             gate=gate,
-            before=residual_statistics(np.linalg.norm(before, axis=2)[use]),
+            before=errors_before,
             after=residual_statistics(np.linalg.norm(residuals, axis=2)[use]),
             placement_alone=residual_statistics(
                 np.linalg.norm(data.p - calibrated.positions(data.q), axis=2)[use]
@@ -333,7 +363,30 @@ def _estimate(
         alternatives=alternatives,
         seconds=time.perf_counter() - began,
         model_fit=fit,
+        placement_fit=alone,
     )
+
+
+def _observability(
+    problem: IdentificationProblem, start: Robot, covariance: FloatArray, hidden: Identifiability
+) -> Observability:
+    """What the data can see; ``covariance`` (P, P) of the parameters."""
+    data, names = problem.data, start.parameter_names
+    rows = start.jacobian(data.q)[np.repeat(data.seen, 3, axis=1)]
+    return Observability(
+        rank=len(names) - len(hidden.fixed),
+        fixed=tuple(names[i] for i in hidden.fixed),
+        unidentifiable=hidden.combinations,
+        resolved_by_prior=_decided_by_prior(start, rows, hidden),
+        nearly_dependent=_hardly_seen(names, covariance, hidden.fixed),
+        prior=_prior_words(problem.model),
+    )
+
+
+def _before(problem: IdentificationProblem, start: Robot, use: BoolArray) -> ResidualStatistics:
+    """Distances of the points in ``use`` (N, targets) with nominal kinematics."""
+    apart = problem.data.p - place_nominal(problem, start).positions(problem.data.q)
+    return residual_statistics(np.linalg.norm(apart, axis=2)[use])
 
 
 def _prior_words(model: ErrorModel) -> str:
@@ -398,16 +451,15 @@ def _accuracy(problem: IdentificationProblem, known: Knowledge, calibrated: Robo
     required = float("nan") if problem.required_accuracy is None else problem.required_accuracy
     if not len(poses):
         nothing = np.empty(0)
-        return Accuracy(poses, nothing, nothing, nothing, problem.accuracy_frame, required)
+        return Accuracy(poses, nothing, nothing, known, problem.accuracy_frame, required)
     complete = np.where(blind, np.inf, known.accuracy(poses, problem.accuracy_frame).per_pose)
-    told = known.predict(poses)
-    own = np.sqrt(np.maximum(np.trace(told.parameters, axis1=2, axis2=3).mean(axis=1), 0.0))  # rounding
-    missed = np.sqrt(np.sum((told.mean - calibrated.positions(poses)) ** 2, axis=2).mean(axis=1))
+    apart = known.poses(poses).points - calibrated.positions(poses)
+    missed = np.sqrt(np.sum(apart**2, axis=2).mean(axis=1))
     return Accuracy(
         test_poses=poses,
         predicted=complete,
-        parameters=np.where(np.isinf(complete), np.inf, own),
         placement=np.hypot(complete, missed),
+        knowledge=known,
         frame=problem.accuracy_frame,
         required=required,
     )

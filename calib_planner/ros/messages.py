@@ -244,6 +244,7 @@ def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
         "test_poses": estimate.accuracy.test_poses,
         "predicted_accuracy": estimate.accuracy.predicted,
     }
+    used = [t for t in estimate.terms if t.used]
     fields: dict[str, Any] = {k: np.asarray(v, float).ravel().tolist() for k, v in numbers.items()}
     fields |= {
         "robot": estimate.calibrated.name,
@@ -256,6 +257,11 @@ def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
         "sigma_estimate": float(estimate.residuals.sigma),
         "residual_rms_before": float(estimate.residuals.before.rms),
         "residual_rms_after": float(estimate.residuals.after.rms),
+        "left_out_rms": float(estimate.left_out.rms),
+        "left_out_predicted_rms": float(estimate.left_out.predicted_rms),
+        "terms": [t.name for t in used],
+        "term_sizes": [float(t.size) for t in used],
+        "accuracy_frame": estimate.accuracy.frame,
         "status": ESTIMATE_STATUS[estimate.fit.status],
         "message": estimate.fit.message,
         "condition": float("nan"),

@@ -11,8 +11,9 @@ nothing is deleted.
 A full fit depends on the measurements in use and on nothing else, so that it is the same after a restart. It is
 made of few measurements, once a plan is complete, and for files. In between, while a long plan is being measured,
 the estimate before is brought up to date (``identify`` with a start), in milliseconds and with the sizes of the
-errors that the last full fit gave; when the visits have grown by a quarter a full fit is made anew. What is
-published then may differ from the full fit, which a restart makes, by a fraction of its standard deviations.
+errors that the last full fit gave; when there are twice as many visits as it had, a full fit is made anew. What
+is published then may differ from the full fit, which a restart makes, by a fraction of its standard deviations;
+the residuals before calibration are those of the last full fit.
 
 Files are saved in the folder that the user chose and nowhere else. Their names are made of the plan's name, which
 comes over the wire: only letters, digits, ``-`` and ``_`` of it become part of a file name, with a hash where

@@ -285,6 +285,19 @@ def test_an_update_says_what_a_fit_at_the_same_scales_says() -> None:
     assert np.abs(told.mean - anew.predict(data.q).mean).max() < 0.02 * std
     assert found.left_out.score == pytest.approx(left.score, rel=1e-3)
     np.testing.assert_allclose(found.left_out.residuals, left.residuals, atol=0.02 * std)
+    before = placement_alone(first)
+    alone = placement_alone(found, before)
+    model = alone.knowledge.model
+    assert alone.converged and model.values == before.knowledge.model.values
+    cold = _Work(alone.knowledge.robot, data.select(rows), model)
+    cold.state = replace(cold.state, doubt=found.doubt)
+    expected = left_out(cold.settle(10, 0))
+    parameters = zip(alone.knowledge.robot.parameter_names, cold.state.coefficients, strict=True)
+    placed = alone.knowledge.robot.with_deviations(dict(parameters))
+    off = alone.knowledge.placed.positions(data.q) - placed.positions(data.q)
+    assert np.abs(off).max() < 0.02 * std
+    assert np.abs(before.knowledge.placed.positions(data.q) - placed.positions(data.q)).max() > 0.1 * std
+    np.testing.assert_allclose(alone.left_out.residuals, expected.residuals, atol=0.02 * std)
     whole = fit_error_model(unknown(robot), data.select(rows), typical())
     apart = whole.knowledge.predict(data.q[40:]).mean - told.mean[40:]
     assert np.sqrt(np.mean(apart**2) / np.mean(np.trace(told.position[40:], axis1=2, axis2=3) / 3.0)) < 0.5

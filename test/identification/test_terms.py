@@ -212,7 +212,29 @@ def test_an_estimate_brought_up_to_date_is_that_of_all_measurements_at_once() ->
     apart = np.linalg.norm(quick.positions(q) - full.positions(q), axis=2)
     assert np.sqrt(np.mean(apart**2)) < 0.2 * full.accuracy.overall
     np.testing.assert_allclose(quick.accuracy.predicted, full.accuracy.predicted, rtol=0.2)
+    np.testing.assert_allclose(quick.accuracy.parameters, full.accuracy.parameters, rtol=0.2)
     assert quick.left_out.rms == pytest.approx(full.left_out.rms, rel=0.1)
+
+
+def test_placement_alone_is_brought_up_to_date_and_what_hardly_changes_is_kept() -> None:
+    robot, _, data, _ = bending()
+    first = identify(IdentificationProblem(robot, data.select(np.arange(38))))
+    now = IdentificationProblem(robot, data, test_poses=POSES / 2.0)
+    quick, full = identify(now, first), identify(now)
+    assert quick.fit.iterations <= 2 < full.fit.iterations
+    q = random_configurations(robot, 30, 4) / 3.0
+    moved = np.linalg.norm(first.calibrated.positions(q) - full.calibrated.positions(q), axis=2)
+    apart = np.linalg.norm(quick.calibrated.positions(q) - full.calibrated.positions(q), axis=2)
+    assert np.sqrt(np.mean(apart**2)) < 0.5 * np.sqrt(np.mean(moved**2))
+    np.testing.assert_allclose(quick.accuracy.placement, full.accuracy.placement, rtol=0.1)
+    assert quick.placement_alone.count == full.placement_alone.count > first.placement_alone.count
+    assert quick.placement_alone.rms == pytest.approx(full.placement_alone.rms, rel=0.05)
+    assert quick.residuals.before == first.residuals.before != full.residuals.before
+    assert quick.observability == first.observability
+    many = IdentificationProblem(robot, data.select(np.arange(15)))
+    anew = identify(now, identify(many))  # more than twice as many
+    assert anew.residuals.before == full.residuals.before and anew.observability == full.observability
+    np.testing.assert_array_equal(anew.placement_values, full.placement_values)
 
 
 def test_a_wrong_measurement_undone_leaves_no_trace() -> None:

@@ -303,7 +303,7 @@ def test_any_numbers_come_back(small: Estimate, data: st.DataObject) -> None:
             calibrated=replace(small.calibrated, name=texts["robot"]),
             fit=replace(small.fit, **finite),
             observability=replace(small.observability, prior=texts["prior"]),
-            accuracy=replace(small.accuracy, parameters=per),
+            accuracy=replace(small.accuracy, placement=per),
         )
         assume(np.isfinite(written.fit.values).all())
         with tempfile.TemporaryDirectory() as folder:

@@ -172,6 +172,12 @@ def test_estimate_there_and_back(robot: Robot, planned: Plan) -> None:
     message = c.estimate_to_message(found, plan_id="p", complete=True)
     assert message.status == CalibrationEstimate.STATUS_OK and message.complete
     assert len(message.covariance) == len(message.parameters) ** 2
+    assert message.left_out_rms == found.left_out.rms
+    assert message.left_out_predicted_rms == found.left_out.predicted_rms
+    assert dict(zip(message.terms, message.term_sizes, strict=True)) == {
+        t.name: t.size for t in found.terms if t.used
+    }
+    assert message.accuracy_frame == "world" and "placement" in message.terms
     back = c.estimate_from_message(message)
     assert back.parameters == found.fit.parameters
     for name in ("nominal", "deviations", "std"):

@@ -101,6 +101,8 @@ class IdentifierOutput:
                 robot=session.robot.name,
                 measurements=sum(int((r.standstill.samples > 0).sum()) for r in session.accepted),
                 condition=float("nan"),
+                left_out_rms=float("nan"),
+                left_out_predicted_rms=float("nan"),
                 status=ESTIMATE_STATUS["too_few" if estimate.missing else "error"],
                 message=estimate.message,
                 **others,
