@@ -2,7 +2,8 @@
 
 Standstills are detected by ``acquisition.Intake``; ``session`` matches, stores, identifies and saves. This file
 carries the messages. All callbacks take turns in one thread: a standstill costs a commit to disk and an
-identification, some 20 ms together, for which the queues of the streams are deep enough by far.
+identification, some 50 ms together and about a second where a full fit of hundreds is due, for which the queues
+of the streams are deep enough.
 
 A measurement is acknowledged on ``~/measurements`` after it is on the disk. While that cannot be written,
 standstills are rejected as not stored and the node goes on; the next standstill tries again.
