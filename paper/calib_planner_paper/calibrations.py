@@ -18,7 +18,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, frozen, plain
 from calib_planner.error_model import ErrorModel, covariance
-from calib_planner.identification import IdentificationProblem, identify
+from calib_planner.identification import fit_error_model
 from calib_planner.planning import InformationModel
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -105,8 +105,8 @@ def calibrate(
     errors = np.empty((laboratory.count, 3))
     for row, seed in enumerate(seeds):
         data = cell.measure(configurations, repetitions, int(seed))
-        estimate = identify(IdentificationProblem(robot, data, sigma, ErrorModel.paper()))
-        errors[row] = estimate.calibrated.positions(pose)[0, 0] - truth
+        estimate = fit_error_model(robot, data, ErrorModel.paper(sigma))
+        errors[row] = estimate.knowledge.placed.positions(pose)[0, 0] - truth
     spread = error_covariance(robot, configurations, repetitions, pose, sigma)
     mean = float(np.trace(spread))
     relative = 0.5 * np.sqrt(2 * np.trace(spread @ spread) / laboratory.count) / mean
