@@ -63,8 +63,10 @@ def test_repetitions_tell_the_noise_and_places_the_rest() -> None:
     assert told.rms > 2 * np.sqrt(3) * 13e-6 and 0.7 < told.predicted_rms / told.rms < 1.5
 
 
-@pytest.mark.parametrize("size", [1.0, 0.1])
-@pytest.mark.parametrize("sigma", [SIGMA, None])
+@pytest.mark.parametrize(
+    ("size", "sigma"),
+    repeats([(1.0, None), (0.1, SIGMA)], [(1.0, None), (1.0, SIGMA), (0.1, None), (0.1, SIGMA)]),
+)
 def test_a_block_of_rows_that_is_shifted_is_named(size: float, sigma: float | None) -> None:
     """The tracker was pushed for twelve visits of forty, and put back."""
     for seed in range(repeats(2, 10)):
