@@ -3,7 +3,7 @@
 docs/glossary.md explains the words.
 """
 
-from calib_planner.identification.alternatives import TABLE, Alternative, explain_gross, find_alternatives
+from calib_planner.identification.alternatives import Alternative
 from calib_planner.identification.doubt import gate_of
 from calib_planner.identification.estimate import (
     FOREMOST,

@@ -273,8 +273,26 @@ class Accuracy:
         return float(np.max(self.predicted)) if len(self.test_poses) else float("nan")
 
 
+class _RobotsPart:
+    """What of measured distances is the robot's own, from ``rms``, ``noise_rms`` [m] and ``freedom``."""
+
+    rms: float
+    noise_rms: float
+    freedom: float
+
+    @property
+    def robot_rms(self) -> float:
+        """The robot's own part of rms [m], see ``without_noise``; all of it where the noise is not stated."""
+        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2)
+
+    @property
+    def robot_least(self) -> float:
+        """What the robot's own part is at least, if chance made rms large [m]."""
+        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2, self.freedom)
+
+
 @dataclass(frozen=True)
-class Validation:
+class Validation(_RobotsPart):
     """Distances on data that took no part in the fit [m].
 
     Attributes:
@@ -300,16 +318,6 @@ class Validation:
     placement_rms: float
     noise_rms: float
     freedom: float
-
-    @property
-    def robot_rms(self) -> float:
-        """The robot's own part of rms [m], see ``without_noise``; all of it where the noise is not stated."""
-        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2)
-
-    @property
-    def robot_least(self) -> float:
-        """What the robot's own part is at least, if chance made rms large [m]."""
-        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2, self.freedom)
 
 
 def without_noise(square: float, noise: float, freedom: float = np.inf) -> float:
@@ -337,7 +345,7 @@ def chance_of(freedom: float) -> float:
 
 
 @dataclass(frozen=True)
-class LeftOutError:
+class LeftOutError(_RobotsPart):
     """Distances of visits from where all other visits predict them, (M4) [m].
 
     Attributes:
@@ -355,16 +363,6 @@ class LeftOutError:
     predicted_rms: float
     noise_rms: float
     freedom: float
-
-    @property
-    def robot_rms(self) -> float:
-        """As ``Validation.robot_rms`` [m]."""
-        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2)
-
-    @property
-    def robot_least(self) -> float:
-        """As ``Validation.robot_least`` [m]."""
-        return without_noise(self.rms**2, np.nan_to_num(self.noise_rms) ** 2, self.freedom)
 
 
 @dataclass(frozen=True)

@@ -383,7 +383,7 @@ def fit_error_model(
         data: The measurements; the joint order may differ from the robot's. Where they hold payloads and the
             elastic term knows none, it gets one at the tip.
         model: The terms, with their scales before the data.
-        robust: Whether impossible points lose weight.
+        robust: Whether impossible points lose weight; default: with every model but the paper's.
         choose: Whether terms with which the left-out score is surely worse go.
         start: An estimate of the same robot and model from most of these data, to be brought up to date: quick,
             with its scales and terms. A full fit is made where it does not do, see ``update_error_model``.

@@ -11,7 +11,6 @@ from calib_planner.arrays import FloatArray, check_configurations, check_number
 from calib_planner.error_model import (
     ACCURACIES,
     ErrorModel,
-    Points,
     Prior,
     gravity_of,
     typical,
@@ -105,9 +104,7 @@ class IdentificationProblem:
         if noise is None and self.data.std is not None and model.is_papers:
             noise = Isotropic(float(np.sqrt(np.mean(np.asarray(self.data.std)[self.data.seen] ** 2))))
         if noise is not None:
-            # The paper's has nothing but noise, so that a stated one leaves nothing to be estimated.
-            points = Points(noise, floor=False) if model.is_papers else replace(model.points, noise=noise)
-            model = replace(model, points=points)
+            model = model.with_noise(noise)
         if self.prior is not None:
             self.prior.places(self.robot.parameter_names)
             model = replace(model, placement=replace(model.placement, stated=self.prior))

@@ -76,7 +76,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
 
     Raises:
         NotEnoughDataError: Fewer equations than unknown parameters, or most points disagree.
-        InputError: The points look like millimetres.
+        InputError: The points are not in metres, or the joints not in radians.
     """
     began = time.perf_counter()
     mistake = None if start is not None else explain_gross(problem.robot, problem.data)
