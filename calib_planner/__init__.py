@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from calib_planner.planning import (
         Candidates,
         Plan,
-        PlanPrior,
         PlanProblem,
         PlanQuality,
         Progress,
@@ -44,7 +43,7 @@ else:
             "identification": "Estimate IdentificationProblem identify validate",
             "io": "Robot",  # ``Robot.load`` reads files, which is what ``io`` teaches it
             "measurements": "Measurements",
-            "planning": "Candidates Plan PlanPrior PlanProblem PlanQuality Progress Search plan",
+            "planning": "Candidates Plan PlanProblem PlanQuality Progress Search plan",
         },
     )
 

@@ -50,7 +50,6 @@ from calib_planner.campaign.finish import ended, toured, validation
 from calib_planner.campaign.state import FIT, VALIDATION, CampaignState, NextStep, PlannedConfiguration
 from calib_planner.errors import CalibPlannerError, InfeasibleError, NotEnoughDataError
 from calib_planner.planning import (
-    PlanPrior,
     PlanProblem,
     Search,
     plan,
@@ -128,7 +127,7 @@ def plan_problem(state: CampaignState, known: Assessment | None) -> PlanProblem:
         accuracy_frame=problem.accuracy_frame,
         criterion="test_pose" if len(poses) == 1 else "worst_pose",
         constraints=state.constraints,
-        prior=PlanPrior(measured=None if known is None else known.used),
+        measured=None if known is None else known.used,
         search=Search(
             starts=problem.starts, seed=problem.seed + len(state.rounds), time_limit=problem.time_limit
         ),

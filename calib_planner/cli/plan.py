@@ -53,7 +53,6 @@ from calib_planner.planning import (
     POSE_CRITERIA,
     Candidates,
     Plan,
-    PlanPrior,
     PlanProblem,
     Progress,
     Search,
@@ -192,7 +191,7 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     option(work, "--configuration-sigma", "S", text, 0.0)
     add_gravity(parser, measured=False)
     known = parser.add_argument_group("what is known beforehand")
-    text = "YAML: parameter name to standard deviation [m | rad], or a prior as for identify, but no estimate; "
+    text = "YAML: parameter name to standard deviation [m | rad], or a prior as for identify; "
     text += f"{TYPICAL}: the data sheet within usual manufacturing errors (none)"
     option(known, "--prior", "FILE", text)
     option(known, "--measured", "FILE", "CSV of measurements already taken: plan the next ones")
@@ -229,13 +228,7 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         require_test_poses(robot, poses)
     candidates, compound = _candidates(args, robot), _compound(getattr(args, "compound", []))
     around = conditions(args, robot)
-    prior = _prior(args.prior, robot)
     model = with_gravity_of(args, _error_model(args, robot, around["noise"]))
-    std: dict[str, float] = {}
-    if prior is not None and model.is_papers:
-        std = _independent(args.prior, prior)
-    elif prior is not None:
-        model = replace(model, placement=replace(model.placement, stated=prior))
     return PlanProblem(
         robot=robot,
         test_poses=poses,
@@ -246,9 +239,10 @@ def make_problem(args: argparse.Namespace, configurations: int, repetitions: int
         criterion=criterion,
         accuracy_frame=args.accuracy_frame,
         compound=compound,
-        repeatability=args.configuration_sigma,
+        configuration_sigma=args.configuration_sigma,
         error_model=model,
-        prior=PlanPrior(std=std, measured=_measured(args, robot)),
+        prior=_prior(args.prior, robot),
+        measured=_measured(args, robot),
         search=Search(
             general_weight=args.general_weight, starts=args.starts, seed=args.seed, time_limit=args.time_limit
         ),
@@ -285,16 +279,6 @@ def _prior(given: str | None, robot: Robot) -> Prior | None:
     if given is None:
         return None
     return typical_prior(robot) if given == TYPICAL else read_prior(given, robot).prior
-
-
-def _independent(given: str, prior: Prior) -> dict[str, float]:
-    """Parameter → standard deviation [m | rad] of a prior, for the paper's model."""
-    covariance = np.asarray(prior.covariance)
-    variances = np.diag(covariance)
-    if (covariance != np.diag(variances)).any():
-        got, valid = f"{given}, whose parameters err together", "independent standard deviations"
-        raise InputError("--prior", got, valid, "give the measurements of that estimate: --measured FILE")
-    return dict(zip(prior.names, np.sqrt(variances).tolist(), strict=True))
 
 
 def _measured(args: argparse.Namespace, robot: Robot) -> Any:

@@ -29,7 +29,6 @@ from calib_planner.planning.problem import (
     GENERAL_SHARE,
     PAPERS_SHARE,
     Candidates,
-    PlanPrior,
     PlanProblem,
     Search,
     usual_error_model,

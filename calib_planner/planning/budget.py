@@ -59,6 +59,8 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
     smallest = smallest_size(problem)
     best: Plan | None = None
     tried: list[Plan] = []
+    nothing_known = problem.measured is None and problem.model.placement.stated is None
+    scales_with_measurements = nothing_known and problem.configuration_sigma == 0 and problem.whole_model is None
     fewest = 0
     for k in _sizes(smallest):
         if k >= smallest + TRIED and best is not None:
@@ -70,7 +72,7 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
         if candidate is None:
             continue
         tried.append(candidate)
-        if not fewest and problem.repeatability == 0 and problem.prior.empty and problem.whole_model is None:
+        if not fewest and scales_with_measurements:
             needed = candidate.measurements * (candidate.quality.value_bound / accuracy) ** 2
             fewest = int(np.ceil(needed * (1 - 1e-9)))
         if best is None or candidate.measurements < best.measurements:
@@ -81,7 +83,7 @@ def plan_for_accuracy(problem: PlanProblem, accuracy: float, watch: Watch = lamb
         raise InfeasibleError(
             "accuracy",
             f"{accuracy:g} m is not reached by {smallest} to {MOST_CONFIGURATIONS} configurations, each repeated "
-            f"up to {MOST_MEASUREMENTS} measurements in all; ask for less, or lower noise or repeatability",
+            f"up to {MOST_MEASUREMENTS} measurements in all; ask for less, or lower the noise",
         )
     return Split(best, tuple(tried), fewest)
 

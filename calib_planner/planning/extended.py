@@ -58,7 +58,7 @@ class ExtendedModel:
         robot: Its active parameters come first among the coefficients, then gravity and joint functions.
         model: How it errs.
         repetitions: r, visits to each configuration.
-        repeatability: σ_c, error of a configuration that repetition does not average away [m].
+        configuration_sigma: σ_c, error of a configuration that repetition does not average away [m].
         basis: (joints, F, b) U_l.
         maps: (joints, F, p) how Φ_l enters the columns: U_l in its place, or less Θ_l.
         coupled: Whether configurations share κ_l; not so in (2).
@@ -67,14 +67,14 @@ class ExtendedModel:
     robot: Robot
     model: ErrorModel
     repetitions: int
-    repeatability: float
+    configuration_sigma: float
     basis: FloatArray
     maps: FloatArray
     coupled: bool = True
 
     @staticmethod
     def of(
-        robot: Robot, model: ErrorModel, felt: FloatArray, repetitions: int = 1, repeatability: float = 0.0
+        robot: Robot, model: ErrorModel, felt: FloatArray, repetitions: int = 1, configuration_sigma: float = 0.0
     ) -> ExtendedModel:
         """The model of a robot whose accuracy matters at the configurations ``felt`` (K, joints); K may be 0."""
         basis = _basis(robot, model, felt)
@@ -83,7 +83,7 @@ class ExtendedModel:
         maps = np.zeros((joints, waves, start + joints * b))
         for joint in range(joints):
             maps[joint, :, start + joint * b : start + (joint + 1) * b] = basis[joint]
-        return ExtendedModel(robot, model, repetitions, repeatability, basis, maps)
+        return ExtendedModel(robot, model, repetitions, configuration_sigma, basis, maps)
 
     @property
     def noise(self) -> Noise:
@@ -192,7 +192,7 @@ class LinearisedExtension:
     def own(self) -> FloatArray:
         """(N, 3·targets, 3·targets) R: what is new at each visit and point [m²]."""
         r = self.model.model.visit_covariance(self.poses) / self.model.repetitions
-        return np.asarray(r + self.model.repeatability**2 * np.eye(r.shape[-1]))
+        return np.asarray(r + self.model.configuration_sigma**2 * np.eye(r.shape[-1]))
 
     def kernels(self, size: int) -> FloatArray:
         """(joints, N/size, size, size) κ_l within each run of ``size`` configurations."""

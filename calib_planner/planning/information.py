@@ -1,7 +1,7 @@
 """What a set of configurations tells about the parameters: the information matrix of eqs. (10) and (11).
 
 Measuring configuration q r times gives, with the point covariance Σ(p) of the instrument and an error of the
-configuration itself that repetition does not average away (robot repeatability, standard deviation σ_c),
+configuration itself that repetition does not average away (standard deviation σ_c),
 
     I(q) = J(q)ᵀ W(q) J(q),      W = (Σ(p(q))/r + σ_c² I)⁻¹  per target,
     M = M_0 + Σ_i I(q_i),        cov(Π̂) = M⁻¹,
@@ -51,13 +51,13 @@ class InformationModel:
     Attributes:
         robot: Its active parameters are the order of all matrices.
         noise: Covariance of one measured point.
-        repeatability: σ_c [m].
+        configuration_sigma: σ_c [m].
         repetitions: r, measurements at each configuration.
     """
 
     robot: Robot
     noise: Noise
-    repeatability: float = 0.0
+    configuration_sigma: float = 0.0
     repetitions: int = 1
 
     def at(self, q: FloatArray) -> FloatArray:
@@ -80,7 +80,7 @@ class InformationModel:
         points, jacobian = self.robot.positions_and_jacobian(q)
         jacobian = np.ascontiguousarray(jacobian)
         if isinstance(self.noise, Isotropic):
-            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.repeatability**2)
+            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2)
         whitener = np.linalg.inv(np.linalg.cholesky(self._covariance(points)))
         return (whitener @ jacobian.reshape(*points.shape, -1)).reshape(jacobian.shape)
 
@@ -94,13 +94,13 @@ class InformationModel:
     def _weigh(self, points: FloatArray, jacobian: FloatArray) -> FloatArray:
         """W J, (N, 3·targets, p)."""
         if isinstance(self.noise, Isotropic):
-            variance = self.noise.sigma**2 / self.repetitions + self.repeatability**2
+            variance = self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2
             return jacobian / variance
         blocks = jacobian.reshape(*points.shape, -1)
         return (np.linalg.inv(self._covariance(points)) @ blocks).reshape(jacobian.shape)
 
     def _covariance(self, points: FloatArray) -> FloatArray:
-        common = self.repeatability**2 * np.eye(3)
+        common = self.configuration_sigma**2 * np.eye(3)
         return self.noise.covariance(points) / self.repetitions + common
 
 
@@ -309,8 +309,8 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
 def _model(problem: PlanProblem, robot: Robot, repetitions: int) -> Model:
     model = problem.whole_model
     if model is None:
-        return InformationModel(robot, problem.instrument, problem.repeatability, repetitions)
-    return ExtendedModel.of(robot, model, problem.test_pose_array, repetitions, problem.repeatability)
+        return InformationModel(robot, problem.instrument, problem.configuration_sigma, repetitions)
+    return ExtendedModel.of(robot, model, problem.test_pose_array, repetitions, problem.configuration_sigma)
 
 
 def _points_and_columns(model: Model, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -332,7 +332,7 @@ def _with_other_terms(problem: PlanProblem, model: ExtendedModel, known: FloatAr
     """
     result = np.eye(model.size)
     result[: len(known), : len(known)] = known
-    data = problem.prior.measured
+    data = problem.measured
     if data is None:
         return result
     for first in range(0, len(data.q), MEASURED_TOGETHER):
@@ -357,23 +357,23 @@ def _representative(problem: PlanProblem, feasibility: Feasibility) -> FloatArra
 def _stated_rows(problem: PlanProblem) -> FloatArray:
     """(rows, P) whitened equations that somebody states of the parameters."""
     names = problem.robot.parameter_names
-    rows = [np.zeros((0, len(names)))]
-    for name, std in problem.prior.std.items():
-        rows.append((np.arange(len(names)) == names.index(name))[None] / std)
-    if problem.error_model is not None:
-        precision = problem.error_model.precision(problem.robot)[: len(names), : len(names)]
-        values, vectors = np.linalg.eigh(precision)
-        rows.append((vectors * np.sqrt(np.maximum(values, 0.0))).T[values > 0.0])
-    return np.concatenate(rows)
+    placement, stated = problem.model.placement, problem.model.placement.stated
+    variances = placement.variances(problem.robot, problem.model.values)
+    rows: FloatArray = np.zeros((0, len(names)))
+    if stated is not None:
+        rows, _ = stated.rows(names, np.zeros(len(names)))
+        variances[stated.places(names)] = np.inf
+    known = np.isfinite(variances)
+    return np.concatenate([rows, np.diag(1.0 / np.sqrt(variances))[known]])
 
 
 def _measured_rows(problem: PlanProblem) -> FloatArray:
     """(rows, P) whitened equations of what is measured already, the points' own noise alone."""
-    names, data = problem.robot.parameter_names, problem.prior.measured
+    names, data = problem.robot.parameter_names, problem.measured
     if data is None:
         return np.zeros((0, len(names)))
     points, jacobian = problem.robot.positions_and_jacobian(data.q)
-    noise = problem.instrument.covariance(points) + problem.repeatability**2 * np.eye(3)
+    noise = problem.instrument.covariance(points) + problem.configuration_sigma**2 * np.eye(3)
     whitener = np.linalg.inv(np.linalg.cholesky(noise))
     whitened = whitener @ jacobian.reshape(*points.shape, -1)
     return np.asarray(whitened[data.seen].reshape(-1, len(names)))

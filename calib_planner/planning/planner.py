@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray, one_thread
-from calib_planner.error_model import FELT, ErrorModel, Poses, covariance, error_variance
+from calib_planner.error_model import FELT, Poses, covariance, error_variance
 from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
 from calib_planner.planning.certify.prove import Proof, prove_bound
 from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
@@ -347,7 +347,7 @@ def _assemble(
         starts=result.starts,
         evaluations=result.evaluations,
         accuracy_frame=problem.accuracy_frame,
-        error_model="paper" if problem.error_model is None else problem.error_model.name,
+        error_model=problem.model.name,
         terms=_terms(space, inverse),
     )
     return Plan(
@@ -369,7 +369,7 @@ def _terms(space: PlanSpace, inverse: FloatArray) -> tuple[PlannedTerm, ...]:
     if not len(poses):
         return ()
     count, points = len(poses) * len(robot.targets), Poses(robot, poses)
-    model = space.problem.error_model or ErrorModel.paper(space.problem.instrument)
+    model = space.problem.model
     rows = space.model.columns(poses).reshape(-1, len(space.prior))
     first = len(robot.parameter_names)
     last = space.model.first if isinstance(space.model, ExtendedModel) else first

@@ -4,54 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, check_array, check_configurations, check_count, check_number
-from calib_planner.error_model import ACCURACIES, ErrorModel, gravity_of, typical
+from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, gravity_of, typical
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA
 from calib_planner.planning.feasibility import Constraint
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
-
-
-@dataclass(frozen=True, eq=False)
-class PlanPrior:
-    """What is known of the parameters before the plan is measured.
-
-    Attributes:
-        std: Parameter name → standard deviation [m | rad].
-        measured: Measurements already taken; the plan is for the *next* configurations.
-    """
-
-    std: Mapping[str, float] = field(default_factory=dict)
-    measured: Measurements | None = None
-
-    @property
-    def empty(self) -> bool:
-        """Whether nothing is known."""
-        return not self.std and self.measured is None
-
-    def checked(self, robot: Robot) -> PlanPrior:
-        """The same in the robot's joint order.
-
-        Raises:
-            InputError: A parameter or joint that the robot does not have, or a number that is not usable.
-        """
-        for name in self.std:
-            if name not in robot.parameter_names:
-                raise UnknownNameError("prior.std", str(name), robot.parameter_names)
-        std = {n: check_number(f"prior.std[{n}]", v, low=0, low_open=True) for n, v in self.std.items()}
-        measured = self.measured
-        if measured is not None:
-            measured = measured.in_order_of(robot.joint_names)
-            have, want = measured.p.shape[1], len(robot.targets)
-            if have != want:
-                raise InputError("prior.measured", f"{have} targets", f"{want}, as the robot has")
-        return PlanPrior(std, measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +98,10 @@ class PlanProblem:
             accuracy. ``None``: as the paper has it, by ``noise`` alone.
         noise: The instrument; a number is the standard deviation of every coordinate of a point [m]. With an
             error model it is that of the model.
-        repeatability: σ_c, error of one coordinate that repeating a measurement at the same configuration does
-            not average away [m].
-        prior: What is known of the parameters beforehand.
+        configuration_sigma: σ_c, error of one coordinate that repeating a measurement at the same configuration
+            does not average away, beside what the error model has of it [m].
+        prior: What is known of parameters beforehand, in place of what the error model has of them.
+        measured: Measurements already taken; the plan is for the *next* configurations.
         constraints: Conditions on configurations besides the joint limits.
         candidates: Configurations to choose from; ``None`` means all that are feasible.
         search: Settings of the search.
@@ -149,8 +115,9 @@ class PlanProblem:
     criterion: str = "test_pose"
     compound: Mapping[str, float] = field(default_factory=dict)
     noise: Noise | float = 3e-5
-    repeatability: float = 0.0
-    prior: PlanPrior = PlanPrior()
+    configuration_sigma: float = 0.0
+    prior: Prior | None = None
+    measured: Measurements | None = None
     constraints: tuple[Constraint, ...] = ()
     candidates: Candidates | None = None
     search: Search = Search()
@@ -171,15 +138,13 @@ class PlanProblem:
         self._check_poses()
         put(self, "configurations", check_count("configurations", self.configurations, high=10_000))
         put(self, "repetitions", check_count("repetitions", self.repetitions, high=100_000))
-        if self.error_model is not None:
-            points = self.error_model.points
-            floor = self.error_model.values.get("floor", 0.0)
-            put(self, "noise", Isotropic(floor) if points.noise is None else points.noise)
         if not hasattr(self.noise, "covariance"):
             put(self, "noise", Isotropic(self.noise))
-        common = check_number("repeatability", self.repeatability, low=0, high=1, unit="m")
-        put(self, "repeatability", common)
-        put(self, "prior", self.prior.checked(robot))
+        points, floor = self.model.points, self.model.values.get("floor", 0.0)
+        put(self, "noise", Isotropic(floor) if points.noise is None else points.noise)
+        common = check_number("configuration_sigma", self.configuration_sigma, low=0, high=1, unit="m")
+        put(self, "configuration_sigma", common)
+        put(self, "measured", self._measured())
         put(self, "search", self.search.chosen(self.whole_model is not None))
         put(self, "constraints", tuple(self.constraints))
         if self.candidates is not None:
@@ -205,11 +170,28 @@ class PlanProblem:
             raise InputError("weights", weights.tolist(), "numbers >= 0, not all zero")
         put(self, "weights", weights)
 
+    def _measured(self) -> Measurements | None:
+        if self.measured is None:
+            return None
+        measured = self.measured.in_order_of(self.robot.joint_names)
+        have, want = measured.p.shape[1], len(self.robot.targets)
+        if have != want:
+            raise InputError("measured", f"{have} targets", f"{want}, as the robot has")
+        return measured
+
+    @cached_property
+    def model(self) -> ErrorModel:
+        """The error model that is planned with: the one given or the paper's, with the prior."""
+        model = ErrorModel.paper(self.noise) if self.error_model is None else self.error_model
+        if self.prior is None:
+            return model
+        self.prior.places(self.robot.parameter_names)
+        return replace(model, placement=replace(model.placement, stated=self.prior))
+
     @property
     def whole_model(self) -> ErrorModel | None:
-        """The error model, or ``None`` where it is the paper's: nothing but flat parameters and noise."""
-        model = self.error_model
-        return None if model is None or model.is_papers else model
+        """The error model, or ``None`` where it is the paper's: nothing but parameters and noise."""
+        return None if self.model.is_papers else self.model
 
     @property
     def starts(self) -> int:

@@ -10,7 +10,8 @@ import pytest
 from robots import mixed, random_configurations, repeats
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
-from calib_planner.planning import Candidates, PlanPrior, Search, plan_space
+from calib_planner.error_model import Prior
+from calib_planner.planning import Candidates, Search, plan_space
 from calib_planner.planning.bound import DesignProblem, approximate_design, maximise_sensitivity
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
@@ -63,9 +64,9 @@ def random_problem(seed: int) -> PlanProblem:
         len(names) + int(rng.integers(0, 3)),
         noise=float(rng.uniform(0.1, 1.0)),
         criterion=str(rng.choice(["test_pose", "test_pose", "worst_pose", "d", "a", "e", "d_star", "o5"])),
-        repeatability=float(rng.choice([0.0, 0.3])),
+        configuration_sigma=float(rng.choice([0.0, 0.3])),
         repetitions=int(rng.integers(1, 3)),
-        prior=PlanPrior(std={names[0]: 0.5} if rng.random() < 0.3 else {}),
+        prior=Prior(names[:1], [0.0], [0.5]) if rng.random() < 0.3 else None,
         search=Search(general_weight=0.0, starts=4, seed=seed),
     )
 

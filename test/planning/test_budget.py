@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, plan
+from calib_planner.error_model import Prior
 from calib_planner.planning import (
-    PlanPrior,
     Search,
     compare,
     plan_for_accuracy,
@@ -50,7 +50,7 @@ def test_fewest_measurements_of_the_two_link_arm(accuracy):
 def test_accuracy_with_an_error_that_repetition_does_not_average():
     """σ_c makes repetition worth less: more configurations, and still the accuracy asked for."""
     plain = plan_for_accuracy(two_link(), 0.4).plan
-    rough = plan_for_accuracy(two_link(repeatability=2 / 3), 0.4).plan
+    rough = plan_for_accuracy(two_link(configuration_sigma=2 / 3), 0.4).plan
     assert plain.quality.value <= 0.4
     assert rough.quality.value <= 0.4
     assert rough.measurements > plain.measurements
@@ -73,7 +73,7 @@ def test_budget_prefers_few_configurations():
 
 
 def test_budget_with_repeatability_prefers_many_configurations():
-    found = split_budget(problem(search=Search(starts=24), repeatability=1e-4), 12)
+    found = split_budget(problem(search=Search(starts=24), configuration_sigma=1e-4), 12)
     assert len(found.plan.configurations) >= 6
 
 
@@ -96,7 +96,7 @@ def test_repetition_is_as_good_as_measuring_again(planned):
     q = planned.configurations
     once = value_of(problem(), q)
     assert value_of(problem(repetitions=9), q) == pytest.approx(once / 3, rel=1e-9)
-    rough = value_of(problem(repeatability=3e-5, repetitions=10_000), q)
+    rough = value_of(problem(configuration_sigma=3e-5, repetitions=10_000), q)
     assert rough == pytest.approx(once, rel=1e-3)
 
 
@@ -128,12 +128,13 @@ def test_prior_and_measured_replace_measurements(planned):
 
     robot = Robot.load("kuka_kr270")
     data = SimulatedCell(robot, {}, 3e-5).measure(planned.configurations, 1, 0)
-    more = plan(problem(configurations=1, prior=PlanPrior(measured=data)))
+    more = plan(problem(configurations=1, measured=data))
     assert more.quality.value < planned.quality.value
     assert more.quality.lower_bound <= more.quality.value
     rows = np.concatenate([planned.configurations, more.configurations])
     assert more.quality.value == pytest.approx(value_of(problem(configurations=5), rows), rel=1e-6)
-    known = plan(problem(prior=PlanPrior({name: 1e-9 for name in robot.parameter_names if name != "q1"})))
+    names = [n for n in robot.parameter_names if n != "q1"]
+    known = plan(problem(prior=Prior(names, np.zeros(len(names)), np.full(len(names), 1e-9))))
     assert known.quality.value < planned.quality.value
 
 

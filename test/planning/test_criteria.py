@@ -125,7 +125,7 @@ def test_gradient_in_the_joints(noise, name, kind):
     p = len(robot.parameter_names)
     tests = accuracy_weights(robot.jacobian(random_configurations(robot, 2, 5)))
     problem = SearchProblem(
-        model=InformationModel(robot, noise, repeatability=1e-5, repetitions=3),
+        model=InformationModel(robot, noise, configuration_sigma=1e-5, repetitions=3),
         criterion=make_criterion(kind, p, tests, [1.0, 1.0]),
         prior=1e6 * np.eye(p),
         size=size,

@@ -16,6 +16,7 @@ from calib_planner.error_model import (
     Knowledge,
     Placement,
     Poses,
+    Prior,
     covariance,
     error_variance,
     typical,
@@ -24,7 +25,6 @@ from calib_planner.error_model.knowledge import information, prior_information
 from calib_planner.measurements import Measurements
 from calib_planner.planning import (
     Candidates,
-    PlanPrior,
     Search,
     plan_for_accuracy,
     plan_space,
@@ -219,10 +219,10 @@ def test_a_prior_and_measurements_only_help() -> None:
     q = random_configurations(robot, 12, 3)
     problem = PlanProblem(robot, POSE, 8, error_model=model)
     alone = value_of(problem, q[:8])
-    stated = replace(problem, prior=PlanPrior({"q1": 1e-5}))
+    stated = replace(problem, prior=Prior(("q1",), [0.0], [1e-5]))
     assert value_of(stated, q[:8]) <= alone * (1 + 1e-9)
     data = Measurements(robot.joint_names, q[8:], robot.positions(q[8:]))
-    assert value_of(replace(problem, prior=PlanPrior(measured=data)), q[:8]) < alone
+    assert value_of(replace(problem, measured=data), q[:8]) < alone
 
 
 def test_flat_parameters_need_as_many_configurations_as_before() -> None:

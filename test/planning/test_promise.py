@@ -19,9 +19,9 @@ from calib_planner import (
     identify,
     plan,
 )
-from calib_planner.error_model import ErrorModel, Knowledge
+from calib_planner.error_model import ErrorModel, Knowledge, Prior
 from calib_planner.measurements import Measurements
-from calib_planner.planning import Candidates, PlanPrior, Search, plan_for_accuracy
+from calib_planner.planning import Candidates, Search, plan_for_accuracy
 from calib_planner.planning.planner import value_of
 
 SIGMA = 3e-5
@@ -114,12 +114,12 @@ def test_more_knowledge_never_makes_a_promise_worse(seed: int) -> None:
     alone = value_of(problem, q[:9])
     for name in ("q1", "base.rz", *rng.choice(robot.parameter_names, 3)):
         for std in (2e-2, 1e-4):
-            known = replace(problem, prior=PlanPrior({str(name): std}))
+            known = replace(problem, prior=Prior((str(name),), [0.0], [std]))
             assert value_of(known, q[:9]) <= alone * (1 + 1e-6)
     told = [value_of(replace(problem, configurations=m), q[:m]) for m in range(9, 15)]
     assert (np.diff(told) <= 1e-9).all()
     data = Measurements(robot.joint_names, q[9:], robot.positions(q[9:]))
-    assert value_of(replace(problem, prior=PlanPrior(measured=data)), q[:9]) == pytest.approx(told[-1], rel=1e-6)
+    assert value_of(replace(problem, measured=data), q[:9]) == pytest.approx(told[-1], rel=1e-6)
 
 
 def test_what_no_configuration_shows_but_the_test_pose_feels_is_infinite() -> None:
