@@ -3,9 +3,10 @@
 On a box the polynomial lies below its largest Bernstein coefficient, and the coefficients at the corners are
 values of it (see ``bernstein``). Boxes whose largest coefficient is at most (1 + tolerance) times the largest
 value known are done; the others are halved along the axis in which their coefficients bend most. Hull and
-polynomial approach each other with the square of the width, so that a maximum is soon alone. Boxes are handled
-by the thousand, depth first: memory stays small. Coarse tolerances come first, so that what is proven when time
-is up is never far behind.
+polynomial approach each other with the square of the width, so that a maximum is soon alone. Those with the
+largest coefficients are halved first, by the thousand, so that whenever the work is ended the largest coefficient
+of the boxes that are left is a bound that is not far behind. Where they would fill the memory, the smallest boxes
+come first, which are soon done.
 """
 
 from __future__ import annotations
@@ -13,18 +14,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, IntArray
-from calib_planner.planning.certify.bernstein import Axis, along, first_boxes, halves
+from calib_planner.planning.certify.bernstein import Axis, first_boxes, halves
 
 CHUNK = 2**20
 """Coefficients handled at once: 8 MB."""
 DEEPEST = 40
 """Most halvings of one axis."""
-COARSE = (0.1, 0.01, 1e-3)
-"""Tolerances on the way."""
+MEMORY = 2**24
+"""Coefficients of boxes that may wait, 128 MB, before the smallest boxes come first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,7 @@ class Maximum:
         largest: Largest value met, or known before.
         where: (k,) place of ``largest``; ``None`` if it was known before.
         boxes: Boxes bounded.
-        late: Whether time was up before the tolerance was reached.
+        late: Whether time or work was up before the tolerance was reached.
     """
 
     upper: float
@@ -53,6 +56,7 @@ def maximise(
     *,
     tolerance: float,
     time_limit: float = float("inf"),
+    most_work: float = float("inf"),
     cancel: Callable[[], bool] = lambda: False,
 ) -> Maximum:
     """Bound the maximum from above and below.
@@ -63,15 +67,17 @@ def maximise(
         known: A value that the polynomial takes somewhere on the box, or zero.
         tolerance: How close ``upper`` shall come to ``largest``, relative.
         time_limit: Seconds; what has been proven by then is returned.
+        most_work: Coefficients of boxes after which the same happens, on any machine at the same box.
         cancel: Called now and then; ``True`` ends the work as the time limit does.
     """
     deadline = time.perf_counter() + time_limit
-    search = _Search(axes, tensor, known, lambda: time.perf_counter() > deadline or cancel())
-    upper = np.inf
-    for step in (*(c for c in COARSE if c > tolerance), tolerance):
-        upper = min(upper, search.run(step))
-        if search.late:
-            break
+    search = _Search(
+        axes,
+        tensor,
+        known,
+        lambda boxes: boxes * tensor.size > most_work or time.perf_counter() > deadline or cancel(),
+    )
+    upper = search.run(tolerance)
     return Maximum(upper, search.largest, search.where, search.boxes, search.late)
 
 
@@ -87,79 +93,106 @@ class _Boxes:
     def __post_init__(self) -> None:
         self.tops = self.forms.reshape(len(self.forms), -1).max(axis=1)
 
-    def at(self, rows: IntArray) -> _Boxes:
+    def __len__(self) -> int:
+        return len(self.tops)
+
+    def at(self, rows: IntArray | NDArray[np.bool_]) -> _Boxes:
         return _Boxes(self.forms[rows], self.centres[rows], self.depths[rows])
+
+    def with_(self, others: _Boxes) -> _Boxes:
+        return _Boxes(
+            np.concatenate([self.forms, others.forms]),
+            np.concatenate([self.centres, others.centres]),
+            np.concatenate([self.depths, others.depths]),
+        )
 
 
 class _Search:
-    """The state of one maximisation; ``run`` may be called again with a finer tolerance."""
+    """The state of one maximisation."""
 
     def __init__(
-        self, axes: tuple[Axis, ...], tensor: FloatArray, known: float, out_of_time: Callable[[], bool]
+        self, axes: tuple[Axis, ...], tensor: FloatArray, known: float, over: Callable[[int], bool]
     ) -> None:
-        self.axes, self.tensor, self.out_of_time = axes, tensor, out_of_time
+        self.axes, self.tensor, self.over = axes, tensor, over
         self.largest = known
         self.where: FloatArray | None = None
         self.boxes, self.late = 0, False
         self.rows = max(CHUNK // max(tensor.size, 1), 1)
+        self.halves = [a.pieces[1] for a in axes]
 
     def run(self, tolerance: float) -> float:
         """An upper bound within ``tolerance`` of the maximum; a looser one when late."""
         upper = 0.0
-        batch: list[tuple[FloatArray, FloatArray]] = []
-        for box in first_boxes(self.axes, self.tensor):
-            batch.append(box)
-            if len(batch) == self.rows:
-                upper = max(upper, self._exhaust(batch, tolerance))
-                batch = []
-        if batch:
-            upper = max(upper, self._exhaust(batch, tolerance))
+        every = first_boxes(self.axes, self.tensor)
+        while batch := list(islice(every, self.rows)):
+            centres, forms = (np.stack(part) for part in zip(*batch, strict=True))
+            upper = max(
+                upper, self._exhaust(_Boxes(forms, centres, np.zeros(centres.shape, np.int64)), tolerance)
+            )
         return max(upper, self.largest)
 
-    def _exhaust(self, batch: list[tuple[FloatArray, FloatArray]], tolerance: float) -> float:
-        """Depth first through the halves of ``batch``; the largest upper bound of boxes that are done."""
-        centres = np.stack([centre for centre, _ in batch])
-        stack = [_Boxes(np.stack([form for _, form in batch]), centres, np.zeros(centres.shape, np.int64))]
+    def _exhaust(self, waiting: _Boxes, tolerance: float) -> float:
+        """Halve the boxes until all are done; the largest upper bound of any."""
         upper = 0.0
-        while stack:
-            boxes = stack.pop()
-            self.boxes += len(boxes.tops)
-            self._look_at_corners(boxes)
-            self.late = self.late or self.out_of_time()
-            wide = boxes.depths.max(axis=1, initial=0) < DEEPEST
-            open_ = (boxes.tops > (1.0 + tolerance) * self.largest) & wide
+        self._look_at(waiting)
+        while True:
+            self.late = self.late or self.over(self.boxes)
+            wide = waiting.depths.max(axis=1, initial=0) < DEEPEST
+            open_ = (waiting.tops > (1.0 + tolerance) * self.largest) & wide
             if self.late or not self.axes:
                 open_[:] = False
-            upper = max(upper, float(boxes.tops[~open_].max(initial=0.0)))
-            rows = np.flatnonzero(open_)
-            for start in range(0, len(rows), self.rows):
-                stack.extend(self._split(boxes.at(rows[start : start + self.rows])))
-        return upper
+            upper = max(upper, float(waiting.tops[~open_].max(initial=0.0)))
+            if not open_.any():
+                return upper
+            waiting = waiting.at(open_)
+            full = len(waiting) * self.tensor.size > MEMORY
+            order = np.argsort(-waiting.depths.sum(axis=1) if full else -waiting.tops, kind="stable")
+            children = self._split(waiting.at(order[: self.rows]))
+            self._look_at(children)
+            rest = order[self.rows :]
+            waiting = waiting.at(rest).with_(children) if len(rest) else children
 
-    def _look_at_corners(self, boxes: _Boxes) -> None:
+    def _look_at(self, boxes: _Boxes) -> None:
         """Raise the largest known value if a corner coefficient, which is a value, exceeds it."""
+        self.boxes += len(boxes)
         ends = (slice(None), *(slice(None, None, size - 1) for size in boxes.forms.shape[1:]))
-        flat = boxes.forms[ends].reshape(len(boxes.tops), -1)
+        flat = boxes.forms[ends].reshape(len(boxes), -1)
         row, corner = np.unravel_index(int(np.argmax(flat)), flat.shape)
         if flat[row, corner] <= self.largest:
             return
         self.largest = float(flat[row, corner])
         sides = np.array(np.unravel_index(corner, (2,) * len(self.axes)), float)
-        half = np.array([a.pieces[1] for a in self.axes]) * 0.5 ** boxes.depths[row]
+        half = np.array(self.halves) * 0.5 ** boxes.depths[row]
         self.where = boxes.centres[row] + (2.0 * sides - 1.0) * half
 
-    def _split(self, boxes: _Boxes) -> list[_Boxes]:
-        """Halve every box along the axis in which its coefficients bend most, group by group."""
-        count, k = len(boxes.tops), len(self.axes)
-        bends = [np.abs(np.diff(boxes.forms, 2, axis=j + 1)).reshape(count, -1).max(axis=1) for j in range(k)]
+    def _split(self, boxes: _Boxes) -> _Boxes:
+        """Halve every box along the axis in which its coefficients bend most, axis by axis."""
+        shape, k = boxes.forms.shape, len(self.axes)
+        bends = [_bend(boxes.forms.reshape(len(boxes), -1, shape[j + 1], _after(shape, j))) for j in range(k)]
         chosen = np.argmax(bends, axis=0)
-        depth = boxes.depths[np.arange(count), chosen]
-        out = []
-        for j, level in sorted({(int(a), int(b)) for a, b in zip(chosen, depth, strict=True)}):
-            group = boxes.at(np.flatnonzero((chosen == j) & (depth == level)))
-            axis, unit = self.axes[j], np.arange(k) == j
-            half = axis.pieces[1] * 0.5**level
-            for side, matrix in zip((-0.5, 0.5), halves(half, axis.turns), strict=True):
-                forms = along(matrix, group.forms, j + 1)
-                out.append(_Boxes(forms, group.centres + side * half * unit, group.depths + unit))
-        return out
+        parts = []
+        for j, axis in enumerate(self.axes):
+            rows = np.flatnonzero(chosen == j)
+            if not len(rows):
+                continue
+            levels = boxes.depths[rows, j]
+            pairs = {level: halves(self.halves[j] * 0.5**level, axis.turns) for level in set(levels.tolist())}
+            forms = boxes.forms[rows].reshape(len(rows), -1, shape[j + 1], _after(shape, j))
+            unit = np.arange(k) == j
+            for side in (0, 1):
+                matrices = np.stack([pairs[level][side] for level in levels.tolist()])
+                shift = (side - 0.5) * self.halves[j] * 0.5**levels
+                moved = (matrices[:, None] @ forms).reshape(len(rows), *shape[1:])
+                parts.append((moved, boxes.centres[rows] + shift[:, None] * unit, boxes.depths[rows] + unit))
+        return _Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _after(shape: tuple[int, ...], axis: int) -> int:
+    """Coefficients of a box, (N, …) being ``shape``, behind its axis of that number."""
+    return int(np.prod(shape[axis + 2 :]))
+
+
+def _bend(forms: FloatArray) -> FloatArray:
+    """(N,) largest second difference of (N, before, size, after) along its third axis."""
+    second = forms[:, :, 2:] - 2.0 * forms[:, :, 1:-1] + forms[:, :, :-2]
+    return np.asarray(np.abs(second, out=second).reshape(len(forms), -1).max(axis=1))
