@@ -50,6 +50,7 @@ setup(
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
         "docs": ["sphinx>=8.1", "myst-parser>=4", "furo"],
         "bags": ["rosbags"],
+        "completion": ["shtab>=1.6"],
         "threads": ["threadpoolctl>=3.1"],
         "collision": ["pin"],
         "distributed": ["dask[distributed]"],

@@ -6,6 +6,7 @@ file or over a wire are of any length; messages show no more of them than a line
 
 from __future__ import annotations
 
+import re
 import reprlib
 from collections.abc import Iterable
 
@@ -14,8 +15,37 @@ import numpy as np
 MOST_CHARACTERS = 60
 """Characters of a refused value that an error shows."""
 
+PER_UNIT = {
+    "m": {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "µm": 1e6, "μm": 1e6, "nm": 1e9, "in": 1 / 0.0254},
+    "rad": {"rad": 1.0, "mrad": 1e3, "urad": 1e6, "µrad": 1e6, "μrad": 1e6}
+    | dict.fromkeys(("deg", "°"), 180.0 / np.pi),
+    "s": {"s": 1.0, "ms": 1e3, "min": 1 / 60, "h": 1 / 3600},
+    "kg": {"kg": 1.0, "g": 1e3},
+}
+"""Unit of a quantity → the units in which people may state it, and how many of these make one of it."""
+QUANTITY = re.compile(r"\s*([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf))\s*([^\s\d.]*)\s*", re.IGNORECASE)
+
 MILLI_UNIT = {"m": "mm", "rad": "mrad"}
 """Unit of a parameter → the unit of 1000 times its value, which tables for people show."""
+
+
+def quantity(text: str, unit: str = "m") -> float:
+    """The number [unit] of a text such as ``2e-5``, ``20um``, ``0.02mm`` or ``20 µm``.
+
+    Args:
+        text: A number, in ``unit`` if it names none.
+        unit: A key of ``PER_UNIT``.
+
+    Raises:
+        ValueError: Another text; says what is valid.
+    """
+    match = QUANTITY.fullmatch(text)
+    others = PER_UNIT[unit]
+    if match is None or match[2] not in {"", *others}:
+        examples = ", ".join(name for name in others if name.isascii())
+        hint = "; use a decimal point" if re.fullmatch(r"\s*[-+]?\d+,\d+\s*\D*", text) else ""
+        raise ValueError(f"expected a number [{unit}], or one with its unit ({examples}), got {text!r}{hint}")
+    return float(match[1]) / others[match[2] or unit]
 
 
 def length(metres: float) -> str:

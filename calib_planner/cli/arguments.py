@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from calib_planner.errors import InputError
 from calib_planner.io import angle_factors, read_configurations
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic
+from calib_planner.units import quantity
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
 Group = argparse._ActionsContainer
@@ -53,11 +55,16 @@ def option(
     """Add an option with a value; its help ends with the default value, if it has one.
 
     Args:
+        text: The help; an option whose help names a unit, [m], [rad], [s] or [kg], takes others too: ``20um``.
         kind: What makes the value out of the text: by default the type of ``default``, or text.
         more: Further arguments of ``add_argument``.
     """
+    units = set(re.findall(r"\[(m|rad|s|kg)\]", text))
     if default is not None:
         kind = kind or type(default)
+    if len(units) == 1 and kind in (float, numbers):
+        kind = (quantity_in if kind is float else quantities_in)(units.pop())
+    if default is not None:
         shown = f"{default:g}" if isinstance(default, (int, float)) else str(default)
         text = f"{text} ({'none' if shown == 'inf' else shown})"
     group.add_argument(flag, type=kind or str, default=default, metavar=metavar, help=text, **more)
@@ -119,6 +126,24 @@ def numbers(text: str) -> list[float]:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected numbers, got {text!r}") from None
+
+
+def quantity_in(unit: str) -> Callable[[str], float]:
+    """What reads a number with or without its unit as a number in ``unit``."""
+
+    def read(text: str) -> float:
+        try:
+            return quantity(text, unit)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return read
+
+
+def quantities_in(unit: str) -> Callable[[str], list[float]]:
+    """The same for numbers separated by spaces or commas, each with or without its unit: ``60mm 0 90mm``."""
+    read = quantity_in(unit)
+    return lambda text: [read(word) for word in text.replace(",", " ").split()]
 
 
 def load_robot(args: argparse.Namespace) -> Robot:

@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
 from calib_planner import __version__
-from calib_planner.cli.terminal import Terminal
+from calib_planner.cli.usage import (
+    HelpfulParser,
+    UsageError,
+    bind_negative,
+    refuse_unknown_options,
+    refuse_unquoted_numbers,
+    suggestion,
+)
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
 
 COMMANDS = {
@@ -30,6 +36,7 @@ COMMANDS = {
     ),
     "simulate": ("calib_planner.cli.simulate", "measure a plan with a simulated robot"),
     "robots": ("calib_planner.cli.robots", "list the shipped robots, or show one"),
+    "completion": ("calib_planner.cli.completion", "print the script that completes words in bash or zsh"),
     "demo": ("calib_planner.cli.demo", "plan, measure and identify a simulated robot"),
     "reproduce": ("calib_planner_paper.reproduce", "the paper's tables and figures, computed again"),
 }
@@ -41,42 +48,84 @@ NO_PAPER = (
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, CLOSED_PIPE = 0, 1, 2, 130, 141
 
 EPILOG = """\
-Units: metres and radians everywhere (REP-103); --degrees for angles in arguments and input files.
-Exit status: 0 done; 1 the work could not be done; 2 wrong usage, also a value that no run could accept.
+Units: metres and radians everywhere (REP-103), a length also as 20um or 0.02mm; --degrees for angles in arguments
+and input files. Exit status: 0 done; 1 the work could not be done; 2 wrong usage, also a value that no run could
+accept. With --json an error is one object too: {"error": {field, got, expected, advice, message}}.
 Example: calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --configurations 4
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    command = next((w for w in words if w in COMMANDS), "")
     try:
-        words = bind_negative(sys.argv[1:] if argv is None else argv)
-        args = parser(next((w for w in words if w in COMMANDS), "")).parse_args(words)
-    except SystemExit as end:
+        args = parse(words, command)
+    except SystemExit as end:  # of --help and --version
         return int(end.code or DONE)
+    except CalibPlannerError as error:
+        return _failed("--json" in words, command, error)
+    from calib_planner.cli.terminal import Terminal  # rich, 0.1 s, which --help does not wait for
+
     terminal = Terminal(json_wanted=args.json)
     try:
         args.run(args, terminal)
         sys.stdout.flush()
         return DONE
     except CalibPlannerError as error:
-        terminal.fail(args.command, str(error))
-        wrong = isinstance(error, InputError) and not isinstance(error, FileFormatError)
-        return WRONG_USAGE if wrong else FAILED
+        return _failed(args.json and not terminal.answered, command, error)
     except BrokenPipeError:
         # Nobody reads on: what is still buffered goes nowhere, so that the interpreter's exit is quiet.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return CLOSED_PIPE
     except KeyboardInterrupt:
-        terminal.fail(args.command, "interrupted")
+        _tell(args.json and not terminal.answered, command, "interrupted")
         return INTERRUPTED
     except Exception as error:
         from numpy.linalg import LinAlgError  # --help and --version do without NumPy
 
         if not isinstance(error, (OSError, MemoryError, LinAlgError)):
             raise
-        terminal.fail(args.command, str(error) or type(error).__name__)
+        _tell(args.json and not terminal.answered, command, str(error) or type(error).__name__)
         return FAILED
+
+
+def parse(words: Sequence[str], command: str) -> argparse.Namespace:
+    """The arguments of a command line, in which ``command`` is the first word that names a command.
+
+    Raises:
+        UsageError: Wrong usage.
+        SystemExit: --help and --version.
+    """
+    top = parser(command)
+    if not command and not {"-h", "--help", "--version"} & {*words}:
+        first = next((w for w in words if not w.startswith("-")), None)
+        if first is not None:
+            expected = f"one of: {', '.join(COMMANDS)}"
+            raise UsageError("command", repr(first), expected, suggestion(first, COMMANDS))
+        top.print_help(sys.stderr)
+        raise SystemExit(WRONG_USAGE)
+    refuse_unknown_options(top, words)
+    refuse_unquoted_numbers(top, words)
+    return top.parse_args(bind_negative(words))
+
+
+def _failed(json_wanted: bool, command: str, error: CalibPlannerError) -> int:
+    """Say why; the exit status."""
+    _tell(json_wanted, command, str(error), error)
+    wrong = isinstance(error, InputError) and not isinstance(error, FileFormatError)
+    return WRONG_USAGE if wrong else FAILED
+
+
+def _tell(json_wanted: bool, command: str, reason: str, error: CalibPlannerError | None = None) -> None:
+    """One line on stderr, and one JSON object on stdout if that is wanted."""
+    one_line = " ".join(reason.split())
+    print(f"{' '.join(['calib-planner', command]).strip()}: {one_line}", file=sys.stderr)
+    if json_wanted:
+        import json
+
+        known = {key: getattr(error, key, None) for key in ("field", "got", "expected", "advice")}
+        print(json.dumps({"error": {**known, "message": one_line}}, ensure_ascii=False))
 
 
 def parser(wanted: str | None = None) -> argparse.ArgumentParser:
@@ -86,15 +135,16 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
         wanted: The only command whose options are added; ``None`` adds those of every command.
 
     Raises:
-        SystemExit: The package of the wanted command is not installed; the reason is on stderr.
+        CalibPlannerError: The package of the wanted command is not installed.
     """
-    top = argparse.ArgumentParser(
+    top = HelpfulParser(
         prog="calib-planner",
         description="Plan robot calibration with a laser tracker, and identify from measurements.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
+    top.set_defaults(all_commands=parser)
     top.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, (module, summary) in COMMANDS.items():
@@ -106,17 +156,5 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
         except ModuleNotFoundError as error:
             if error.name != "calib_planner_paper":
                 raise
-            top.exit(FAILED, f"calib-planner {name}: {NO_PAPER}\n")
+            raise CalibPlannerError(NO_PAPER) from None
     return top
-
-
-def bind_negative(argv: Sequence[str]) -> list[str]:
-    """``--flag -1,2`` as ``--flag=-1,2``: argparse would take numbers that start with a minus for a flag."""
-    bound: list[str] = []
-    for word in argv:
-        flag = bound[-1] if bound else ""
-        if re.match(r"-\.?\d", word) and flag.startswith("--") and "=" not in flag and len(flag) > 2:
-            bound[-1] = f"{flag}={word}"
-        else:
-            bound.append(word)
-    return bound

@@ -32,15 +32,20 @@ class Terminal:
 
     Args:
         json_wanted: The answer is one JSON object; tables are not shown.
+
+    Attributes:
+        answered: Whether an answer was printed.
     """
 
     def __init__(self, *, json_wanted: bool) -> None:
         self.json_wanted = json_wanted
+        self.answered = False
         self.out = _console(sys.stdout)
         self.err = _console(sys.stderr)
 
     def answer(self, result: Mapping[str, Any], show: Callable[[Console], None]) -> None:
         """Print ``result`` as JSON if that is wanted, otherwise what ``show`` prints."""
+        self.answered = True
         if self.json_wanted:
             print(json.dumps(result, allow_nan=False, ensure_ascii=False))
         else:
@@ -49,11 +54,6 @@ class Terminal:
     def note(self, text: str) -> None:
         """Say something that is not the answer."""
         self.err.print(text, soft_wrap=True)
-
-    def fail(self, command: str, reason: str) -> None:
-        """Say in one line why the work could not be done."""
-        one_line = " ".join(reason.split())
-        print(f"calib-planner {command}: {one_line}", file=sys.stderr)
 
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[float, str], None]]:

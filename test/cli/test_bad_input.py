@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from calib_planner.cli import main
-from calib_planner.cli.main import bind_negative
+from calib_planner.cli import main, parser
+from calib_planner.cli.usage import bind_negative, refuse_unquoted_numbers
 from calib_planner.identification import solver
 
 PLAN = "plan --robot planar_2r --starts 2 --configurations"
@@ -43,8 +44,17 @@ FILES = {
 
 CASES = {
     # wrong usage: 2
-    "no command": ("", 2, ["required", "COMMAND"]),
+    "no command": ("", 2, ["COMMAND", "identify", "plan"]),
     "unknown command": ("calibrate", 2, ["calibrate", "identify"]),
+    "mistyped command": ("identfy --data good.csv", 2, ["'identfy'", "did you mean identify?"]),
+    "mistyped option": (f"{PLAN} 2 --tset-pose 0,0", 2, ["--tset-pose", "did you mean --test-pose?"]),
+    "mistyped choice": (f"{IDENTIFY} good.csv --loss robost", 2, ["--loss", "did you mean robust?"]),
+    "mistyped action": ("robots shwo planar_2r", 2, ["'shwo'", "did you mean show?"]),
+    "pose without quotes": (f"{PLAN} 2 --test-pose -0.5 0.2", 2, ['quote it: --test-pose "-0.5 0.2"']),
+    "negative number inside": (f"{PLAN} 2 --test-pose 0 -60", 2, ['quote it: --test-pose "0 -60"']),
+    "unknown unit": (f"{PLAN} 2 --test-pose 0,0 --sigma 3ft", 2, ["--sigma", "m, cm, mm, um", "'3ft'"]),
+    "decimal comma": (f"{PLAN} 2 --test-pose 0,0 --sigma 0,3mm", 2, ["--sigma", "use a decimal point"]),
+    "two sizes": (f"{PLAN} 2 --accuracy 1mm", 2, ["--accuracy", "one of the two", "--configurations"]),
     "unknown flag": (f"{PLAN} 2 --test-pose 0,0 --speed 3", 2, ["--speed"]),
     "abbreviated flag": (f"{PLAN} 2 --test-po 0,0", 2, ["--test-po"]),
     "no robot": ("plan --configurations 2", 2, ["--robot"]),
@@ -74,7 +84,11 @@ CASES = {
     "plan's ending": (f"{PLAN} 2 --test-pose 0,0 --output p.txt", 2, ["--output", ".yaml or .csv"]),
     "output folder": (f"{PLAN} 2 --test-pose 0,0 --output no/p.csv", 2, ["--output", "No such file"]),
     "loss": (f"{IDENTIFY} good.csv --loss square", 2, ["--loss", "linear"]),
-    "sigma and instrument": (f"{IDENTIFY} good.csv --sigma 1 --instrument x", 2, ["not allowed with"]),
+    "sigma and instrument": (
+        f"{IDENTIFY} good.csv --sigma 1 --instrument x",
+        2,
+        ["--instrument", "one of the two", "--sigma"],
+    ),
     "sigma of data": (f"{IDENTIFY} good.csv --sigma 0", 2, ["sigma", "(0, inf] m"]),
     "required accuracy": (f"{IDENTIFY} good.csv --required-accuracy nan", 2, ["required_accuracy", "nan"]),
     "file twice": (f"{IDENTIFY} good.csv --data ./good.csv", 2, ["--data", "good.csv again", "no measurement"]),
@@ -95,7 +109,7 @@ CASES = {
     "cell": (f"{IDENTIFY} word.csv", 1, ["word.csv", "line 2, column q2", "'zero'", "finite number"]),
     "NaN in a cell": (f"{IDENTIFY} nan.csv", 1, ["nan.csv", "line 2, column q2", "'nan'"]),
     "joint name": (f"{IDENTIFY} joints.csv", 1, ["no column q2", "q1, q3", "rename or add them"]),
-    "options of old": (f"{IDENTIFY} good.csv --folds 4", 2, ["unrecognized arguments", "--folds"]),
+    "options of old": (f"{IDENTIFY} good.csv --folds 4", 2, ["an unknown option", "--folds"]),
     "error model": (f"{IDENTIFY} good.csv --error-model nowhere.yaml", 1, ["nowhere.yaml"]),
     "accuracy frame": (f"{IDENTIFY} good.csv --accuracy-frame tool", 2, ["--accuracy-frame", "world", "robot"]),
     "too few points": (
@@ -183,6 +197,56 @@ def test_an_estimate_that_does_not_settle_is_no_success(
     assert (
         out.startswith("FAIL") and "not_converged" in out and "Nothing was written" in err and not output.exists()
     )
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "wanted"),
+    [
+        (f"{IDENTIFY} good.csv --loss robost", 2, {"field": "--loss", "got": "'robost'"}),
+        (f"{IDENTIFY} good.csv --los robust", 2, {"field": "--los", "advice": "did you mean --loss?"}),
+        (f"{IDENTIFY} none.csv", 1, {"field": "none.csv: file", "advice": "check the path"}),
+        ("robots show planar", 2, {"field": "robot", "advice": "did you mean 'planar_2r'?"}),
+        ("identfy", 2, {"field": "command", "got": "'identfy'"}),
+        (f"{PLAN} 1 --test-pose 0,0", 1, {"field": None}),
+    ],
+)
+def test_errors_as_json(
+    line: str,
+    status: int,
+    wanted: dict[str, str | None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One object on stdout; the same line on stderr and the same status as without --json."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "good.csv").write_text(FILES["good.csv"])
+    assert main([*line.split(), "--json"]) == status
+    out, err = capsys.readouterr()
+    error = json.loads(out)["error"]
+    assert error.keys() == {"field", "got", "expected", "advice", "message"}
+    assert {key: error[key] for key in wanted} == wanted
+    assert err.count("\n") == 1 and err.rstrip().endswith(error["message"])
+    assert main(line.split()) == status
+    assert capsys.readouterr() == ("", err)
+
+
+def test_an_answer_is_the_only_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An identification that does not settle is answered with what there is, and its status says so."""
+    (tmp_path / "good.csv").write_text(FILES["good.csv"])
+    settled = solver._fit
+    monkeypatch.setattr(solver, "_fit", lambda *a: replace(settled(*a), converged=False))
+    assert main([*f"{IDENTIFY} {tmp_path / 'good.csv'}".split(), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["status"] == "not_converged"
+
+
+def test_numbers_that_need_no_quotes(capsys: pytest.CaptureFixture[str]) -> None:
+    """A single number, numbers with commas, and several values of an option that takes several."""
+    top = parser("compare")
+    for line in ("--weights -1", "--test-pose -1,2", "--configurations 3 4 --test-pose=1,-2"):
+        refuse_unquoted_numbers(top, ["compare", *line.split()])
 
 
 def test_bind_negative() -> None:

@@ -192,6 +192,7 @@ COMMANDS = (
     "compensate",
     "simulate",
     "robots",
+    "completion",
     "demo",
     "reproduce",
 )

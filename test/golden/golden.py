@@ -164,7 +164,7 @@ def answer(case: Case, inputs: Inputs, folder: Path) -> dict[str, Any]:
     status, out, err = call(case.words, folder)
     found: dict[str, Any] = {"line": case.line, "status": status}
     if status:
-        found |= {"output": out, "message": err.strip()}
+        found |= {"output": out if case.tables else json.loads(out), "message": err.strip()}
     elif "--help" in case.words:
         found["options"] = dict.fromkeys(options(out), True)
     elif case.tables:
