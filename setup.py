@@ -51,6 +51,7 @@ setup(
         "docs": ["sphinx>=8.1", "myst-parser>=4", "furo"],
         "bags": ["rosbags"],
         "completion": ["shtab>=1.6"],
+        "xacro": ["xacro>=2.1"],
         "threads": ["threadpoolctl>=3.1"],
         "collision": ["pin"],
         "distributed": ["dask[distributed]"],

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib_planner.arrays import FloatArray
+from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
 from calib_planner.io import angle_factors, read_configurations
 from calib_planner.robot import Robot
@@ -147,8 +148,10 @@ def quantities_in(unit: str) -> Callable[[str], list[float]]:
 
 
 def load_robot(args: argparse.Namespace) -> Robot:
-    """The robot of ``add_robot``, with its targets, its parameters as the file says."""
+    """The robot of ``add_robot``, with its targets and the parameters of its file, whose oddities are said."""
     robot = Robot.load(args.robot, base_link=args.base_link, tip_link=args.tip_link)
+    for remark in robot.remarks:
+        Terminal(json_wanted=args.json).note(f"{args.robot}: {remark}")
     return robot if args.targets is None else robot.with_targets(rows("--targets", args.targets, "xyz"))
 
 

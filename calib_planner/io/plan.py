@@ -33,6 +33,7 @@ from calib_planner.io.csv import REPETITIONS
 from calib_planner.io.robots import URDF_SUFFIXES
 from calib_planner.io.text import write_text
 from calib_planner.io.urdf import read_speed_limits
+from calib_planner.io.xacro import split_arguments
 from calib_planner.io.yaml import Node, read_document, write_document
 from calib_planner.planning import DWELL, KEYS, KINDS, Pace, Plan, PlanSheet, usual_pace
 from calib_planner.robot import Robot
@@ -105,8 +106,9 @@ def robot_pace(robot: Robot, dwell: float = DWELL, share: float = SHARE) -> Pace
     Args:
         dwell: Time at standstill for each measurement [s].
     """
-    usual, path = usual_pace(robot, dwell), Path(robot.source)
-    limits = read_speed_limits(path, robot.joint_names) if path.suffix.lower() in URDF_SUFFIXES else None
+    usual, path = usual_pace(robot, dwell), split_arguments(robot.source)[0]
+    speeds = path.suffix.lower() in URDF_SUFFIXES
+    limits = read_speed_limits(robot.source, robot.joint_names) if speeds else None
     if limits is None:
         return usual
     return replace(usual, speeds=share * limits, origin=f"at most {share:.3g} of the URDF's speed limits")

@@ -41,6 +41,7 @@ import numpy as np
 
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
 from calib_planner.io.urdf import read_urdf
+from calib_planner.io.xacro import split_arguments
 from calib_planner.io.yaml import Node, read_yaml
 from calib_planner.robot import (
     KINDS,
@@ -90,7 +91,7 @@ def shipped_robots() -> Sequence[str]:
 
 def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
     """See ``Robot.load``."""
-    path = Path(source).expanduser()
+    path, arguments = split_arguments(source)
     shipped = str(source) in shipped_robots()
     if shipped:
         path = config_folder() / "robots" / f"{source}.yaml"
@@ -100,7 +101,7 @@ def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: st
             "robot", str(source), [*shipped_robots(), "PATH.urdf", "PATH.yaml (an existing file)"]
         )
     if suffix in URDF_SUFFIXES:
-        return read_urdf(path, base_link, tip_link)
+        return read_urdf(source if arguments else path, base_link, tip_link)
     for field, link in (("base_link", base_link), ("tip_link", tip_link)):
         if link is not None:
             advice = f"leave it out: {path.name} is one chain"

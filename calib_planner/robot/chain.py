@@ -65,6 +65,7 @@ class Robot:
         source: What the robot was read from.
         from_urdf: Whether it was read from a URDF, that is from the description of a real robot.
         link_masses: What its file says of the masses of its links; see ``mass_fault``.
+        remarks: What is odd in its file, or was chosen when it was read, sentences without a full stop.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Robot:
     source: str = ""
     from_urdf: bool = False
     link_masses: tuple[LinkMass, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         joints = [e.joint for e in self.elements if e.joint is not None]

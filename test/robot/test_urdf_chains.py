@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from robots import random_configurations
 
 from calib_planner import FileFormatError, InputError, Robot, UnknownNameError
 from calib_planner.cli import main
-from calib_planner.io import parse_urdf
+from calib_planner.io import calibrated_urdf, parse_urdf
 
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
 
@@ -47,10 +48,9 @@ def test_a_frame_on_the_base_is_not_a_tip():
     np.testing.assert_allclose(robot.positions(np.zeros(2))[0, 0], [0, 0, 0.3], atol=1e-15)
 
 
-def test_branches_are_named_and_can_be_chosen():
+def test_a_frame_on_the_way_is_no_tip_but_can_be_chosen():
     text = robot_of(*ARM, joint("camera", "l1", "eye", "fixed", ""))
-    with pytest.raises(FileFormatError, match=r"2 possible tips: eye, tool0; name .*--tip-link"):
-        read(text)
+    assert read(text).joint_names == ("j1", "j2") and not read(text).remarks
     assert read(text, tip_link="eye").joint_names == ("j1",)
     assert read(text, tip_link="tool0").joint_names == ("j1", "j2")
     assert read(text, base_link="l1").joint_names == ("j2",)  # seen from there, the camera does not move
@@ -62,6 +62,29 @@ def test_a_tip_within_the_tree_and_a_base_above_the_root():
     from_world, from_base = read(text), read(text, base_link="base_link")
     q = random_configurations(from_world, 4)
     np.testing.assert_allclose(from_world.positions(q) - from_base.positions(q), [[[0, 0, 0.1]]] * 4, atol=1e-15)
+
+
+@pytest.mark.parametrize("tool", ["tool0", "left_tool0", "arm/tool0"])
+def test_of_several_ends_tool0_is_the_tip_and_is_named(tool):
+    """A flange beside it, a balancer that a link carries, fingers behind it."""
+    arm = tuple(part.replace("tool0", tool) for part in ARM)
+    flange = joint("f", "l2", "flange", "fixed", "").replace("0 0 0.1", "0 0 0.2")
+    beside = (flange, joint("cylinder", "l1", "balancer", "fixed", ""))
+    fingers = tuple(part.replace("tool0", tool) for part in GRIPPER)
+    for more, ends in ((beside, "flange"), (fingers, "f1, f2"), ((joint("rod", "base_link", "rod_1"),), "rod_1")):
+        robot = read(robot_of(*arm, *more))
+        assert robot.joint_names == ("j1", "j2")
+        assert robot.remarks == (f"the chain ends at {tool}; further ends of the file are {ends} (--tip-link)",)
+
+
+def test_ends_in_one_place_are_one_tip_and_others_are_asked_for():
+    twin = joint("f", "l2", "flange", "fixed", "")
+    arm = (*ARM[:2], joint("hand", "l2", "hand", "fixed", ""))
+    assert read(robot_of(*arm, twin)).joint_names == ("j1", "j2")
+    with pytest.raises(
+        FileFormatError, match=r"2 possible tips: flange, hand; .*, or 'l2', from which they go on"
+    ):
+        read(robot_of(*arm, twin.replace('xyz="0 0 0.1"', 'xyz="0 0 0.2"')))
 
 
 def test_two_arms_need_both_links():
@@ -121,6 +144,62 @@ def test_an_oddity_elsewhere_does_not_stop_the_arm(oddity):
     assert read(text, tip_link="tool0").joint_names == ("j1", "j2")
     with pytest.raises(FileFormatError, match="joint 'g'"):
         read(text)
+
+
+BESIDE = {
+    "a blank first line": lambda text: f'\n  <?xml version="1.0"?>\n{text}',
+    "a default namespace": lambda text: text.replace("<robot ", '<robot xmlns="http://example.org/urdf" '),
+    "an undeclared prefix": lambda text: text.replace("</robot>", "<gazebo:plugin/></robot>"),
+    "an unknown encoding": lambda text: f'<?xml version="1.0" encoding="nonsense"?>{text}',
+    "a macro in a picture": lambda text: text.replace(
+        "<link name='l1'/>", "<link name='l1'><visual><xacro:grey/></visual></link>"
+    ),
+    "a macro of a transmission": lambda text: text.replace("</robot>", '<xacro:drive j="j1"/></robot>'),
+    "an expression of a plugin": lambda text: text.replace("</robot>", '<gazebo v="${prefix}c"/></robot>'),
+    "a joint to nowhere": lambda text: text.replace("</robot>", joint("x", "l2", "nothing") + "</robot>"),
+    "a joint from nowhere": lambda text: text.replace("</robot>", joint("x", "nothing", "l9") + "</robot>"),
+    "a joint without a child": lambda text: text.replace("</robot>", '<joint name="x"/></robot>'),
+    "a kind of joint of another program": lambda text: text.replace(
+        "</robot>", "<link name='s'/>" + joint("x", "base_link", "s", "screw") + "</robot>"
+    ),
+    "a loop of other links": lambda text: text.replace(
+        "</robot>", "<link name='u'/><link name='v'/>" + joint("x", "u", "v") + joint("y", "v", "u") + "</robot>"
+    ),
+    "a rod that closes a loop": lambda text: text.replace(
+        "</robot>", "<link name='u'/>" + joint("x", "l1", "u") + joint("y", "base_link", "u") + "</robot>"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("oddity", BESIDE)
+def test_what_stands_beside_the_chain_does_not_matter(oddity):
+    """Neither when the robot is read nor when its calibrated URDF is written."""
+    plain = robot_of(*ARM)
+    text = BESIDE[oddity](plain)
+    assert text != plain
+    robot, q = read(text), random_configurations(read(plain), 5)
+    np.testing.assert_array_equal(robot.positions(q), read(plain).positions(q))
+    calibrated = robot.with_deviations({"j1.x": 1e-3, "j2.offset": 2e-3})
+    written, changes = calibrated_urdf(text, calibrated)
+    assert changes.joints == ("j1", "j2")
+    np.testing.assert_allclose(read(written).positions(q), calibrated.positions(q), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "limits", "word"),
+    [
+        ("-1e16", "1e16", (-180, 180), "j1 is treated as continuous, from -180 to 180 degrees"),
+        ("-999999", "999999", (-180, 180), "treated as continuous"),
+        ("-180", "180", (-180, 180), "they are read as degrees"),
+        ("-120", "60", (-120, 60), "limits of j1 are -120 and 60 rad: they are read as degrees"),
+        ("-62.83185", "62.83185", (-3600, 3600), ""),  # ten turns, in radians
+        ("-7.854", "7.854", (-450.00105, 450.00105), ""),
+    ],
+)
+def test_absurd_limits_are_named(low, high, limits, word):
+    robot = read(limited(f'<limit lower="{low}" upper="{high}"/>'))
+    np.testing.assert_allclose(np.rad2deg(robot.joint_limits[0]), limits, atol=1e-3)
+    assert [word in remark for remark in robot.remarks] == [True] * bool(word)
 
 
 # ── with what numbers ────────────────────────────────────────────────────────────────────────────────
@@ -218,7 +297,7 @@ def limited(limit):
 
 
 REFUSED = {
-    "xacro": (XACRO, "a xacro file; expand it first: xacro"),
+    "xacro": (XACRO, "a xacro file; pip install 'calib_planner[xacro]', or expand it first: xacro"),
     "xacro without its namespace": ('<robot name="r"><xacro:arm prefix=""/></robot>', "xacro FILE"),
     "xacro by its expressions": (changed("0 0 0.1", "0 0 ${h}"), "xacro FILE"),
     "sdf": ('<?xml version="1.0"?><sdf version="1.9"><model name="m"/></sdf>', "an SDF model; export the robot"),
@@ -240,11 +319,20 @@ REFUSED = {
     "an infinite limit": (changed('upper="1"', 'upper="inf"'), "joint 'j1' limit: expected 1 finite"),
     "a decimal comma": (changed("0 0 0.1", "0 0 0,1"), "joint 'j1' origin xyz: expected 3 finite"),
     "screws": (changed("revolute", "screw"), "revolute, continuous, prismatic or fixed"),
+    "a slide in millimetres": (
+        changed("revolute", "prismatic").replace('upper="1"', 'upper="500"'),
+        "joint 'j1' limit: expected within 100 m, got [-1, 500]; limits of a sliding joint are metres",
+    ),
+    "macros around a chain that breaks": (
+        robot_of(joint("j1", "nowhere", "b"), links="b", more="<xacro:arm/>"),
+        "expand it first: xacro FILE.urdf.xacro > robot.urdf (as it stands, joint 'j1'",
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refusals_name_the_place_and_what_to_do(tmp_path, case):
+def test_refusals_name_the_place_and_what_to_do(tmp_path, monkeypatch, case):
+    monkeypatch.setitem(sys.modules, "xacro", None)  # as if it were not installed
     text, needle = REFUSED[case]
     path = tmp_path / f"robot{'.urdf.xacro' if 'xacro' in case else '.sdf' if case == 'sdf' else '.urdf'}"
     path.write_text(text)
@@ -283,7 +371,7 @@ def test_commands_take_the_links(tmp_path, capsys):
     """plan, simulate and identify on one branch of a tree; without the links each says what to give."""
     path, plan, data = (str(tmp_path / n) for n in ("r.urdf", "plan.csv", "data.csv"))
     planar = (joint("j1", "base_link", "l1"), joint("j2", "l1", "l2"), joint("hand", "l2", "tool0", "fixed", ""))
-    (tmp_path / "r.urdf").write_text(robot_of(*planar, joint("camera", "l1", "eye", "fixed", "")))
+    (tmp_path / "r.urdf").write_text(robot_of(*planar, joint("camera", "l1", "eye")))
     robot = ("--robot", path, "--targets", "0.1 0.2 0.3", "--parameters", "offsets")
     planned = (
         "plan",
@@ -308,6 +396,6 @@ def test_commands_take_the_links(tmp_path, capsys):
     assert "j1.offset" in out and "j2.offset" in out
     assert main(["robots", "show", path, "--tip-link", "eye"]) == 0
     assert (
-        "Levels for --parameters: offsets (1), lengths (1), lengths+offsets (2), full (6)"
+        "Levels for --parameters: offsets (2), lengths (2), lengths+offsets (4), full (12)"
         in capsys.readouterr().out
     )

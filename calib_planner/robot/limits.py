@@ -1,0 +1,61 @@
+"""Joint limits that cannot be meant as they stand, and what is made of them.
+
+Descriptions of robots state limits in radians and metres. Three kinds of numbers are something else:
+
+* A joint "without limits" is often written as a huge number (1e16). A plan within it would stop anywhere, 1e17
+  degrees away: the joint is treated as continuous, from −180° to 180°.
+* Limits of −180 and 180 are degrees: 28 turns either way are no arm's. They are read as degrees. If they
+  were radians after all, the range would be narrower than it could be, and never wider.
+* A sliding joint of hundreds of metres was written in millimetres, or has no limits. Nothing can be assumed.
+
+Joints of arms turn by less than two turns either way (in 110 public URDFs of six and seven axes: by 1.25), and
+those that turn further have limits of whole half turns in radians, which stay.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib_planner.errors import InputError
+
+MOST_TURN = 4.0 * np.pi
+"""No joint's own limit is further than this from zero, two turns, unless it is of whole half turns [rad]."""
+MOST_DEGREES = 720.0
+"""The same two turns in degrees: up to this the number may have been meant as degrees."""
+HALF_TURNS = 1e-3
+"""A number this near to a whole number of half turns is one [half turns]."""
+MOST_SLIDE = 100.0
+"""No joint slides further than this from its zero [m]."""
+
+
+def believable_limits(name: str, low: float, high: float, *, turns: bool) -> tuple[float, float, str]:
+    """Limits that plans may use, and what to say about it.
+
+    Args:
+        name: The joint.
+        low, high: Limits as they stand in its file [rad | m].
+        turns: Whether the joint turns.
+
+    Returns:
+        Lower and upper limit [rad | m], and a sentence, empty if the limits stay as they are.
+
+    Raises:
+        InputError: A sliding joint whose limits cannot be metres.
+    """
+    far = max(abs(low), abs(high))
+    if not turns:
+        if far > MOST_SLIDE:
+            advice = "limits of a sliding joint are metres: are these millimetres?"
+            raise InputError(f"limits of {name}", f"[{low:g}, {high:g}]", f"within {MOST_SLIDE:g} m", advice)
+        return low, high, ""
+    if far <= MOST_TURN or _half_turns(low, high):
+        return low, high, ""
+    stated = f"limits of {name} are {low:g} and {high:g} rad"
+    if far <= MOST_DEGREES:
+        return float(np.deg2rad(low)), float(np.deg2rad(high)), f"{stated}: they are read as degrees"
+    return -np.pi, np.pi, f"{stated}: {name} is treated as continuous, from -180 to 180 degrees"
+
+
+def _half_turns(low: float, high: float) -> bool:
+    count = np.array([low, high]) / np.pi
+    return bool(np.abs(count).max() < MOST_DEGREES and np.abs(count - np.rint(count)).max() < HALF_TURNS)
