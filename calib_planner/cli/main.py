@@ -27,6 +27,7 @@ from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
 COMMANDS = {
     "plan": ("calib_planner.cli.plan", "choose the configurations to be measured"),
     "sheet": ("calib_planner.cli.sheet", "a plan for the person at the robot"),
+    "program": ("calib_planner.cli.program", "a plan for the robot's controller"),
     "campaign": ("calib_planner.cli.campaign", "plan, measure and identify until it is accurate enough"),
     "compare": ("calib_planner.cli.compare", "the proposed plan beside random plans (Table 2)"),
     "identify": ("calib_planner.cli.identify", "identify parameters from measurements"),

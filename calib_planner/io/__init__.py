@@ -38,6 +38,19 @@ if TYPE_CHECKING:
         write_trajectory,
     )
     from calib_planner.io.prior import read_prior
+    from calib_planner.io.programs import (
+        HANDSHAKES,
+        SETTLE,
+        SPEED_SHARE,
+        ProgramFormat,
+        ProgramSettings,
+        controller_axes,
+        program_formats,
+        program_name,
+        program_text,
+        read_program_format,
+        write_program,
+    )
     from calib_planner.io.sources import Sources, SourceSettings, read_source, read_sources
     from calib_planner.io.store import (
         ACCEPTED,
@@ -83,6 +96,8 @@ else:
             "plan": "SHARE SHEET_FILES WORDS read_plan robot_pace write_plan write_sheet_csv write_sheet_yaml "
             "write_trajectory",
             "prior": "read_prior",
+            "programs": "HANDSHAKES SETTLE SPEED_SHARE ProgramFormat ProgramSettings controller_axes "
+            "program_formats program_name program_text read_program_format write_program",
             "sources": "Sources SourceSettings read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
             "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "

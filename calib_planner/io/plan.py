@@ -204,15 +204,28 @@ def trajectory_text(sheet: PlanSheet) -> str:
     return note + yaml.safe_dump(trajectory(sheet), sort_keys=False, width=100)
 
 
+def require_reachable(sheet: PlanSheet, consequence: str) -> None:
+    """Refuse to send a robot to a configuration that is not reachable.
+
+    Args:
+        sheet: The visits with their checks.
+        consequence: What therefore does not happen, for the error.
+
+    Raises:
+        InfeasibleError: Names the first such visit and what it breaks.
+    """
+    for i, broken in enumerate(sheet.checks.reach_breaks, 1):
+        if broken:
+            raise InfeasibleError(", ".join(broken), f"visit {i} of the plan breaks it; {consequence}")
+
+
 def trajectory(sheet: PlanSheet) -> dict[str, Any]:
     """The message as a mapping, fields in the order of their definition.
 
     Raises:
         InfeasibleError: A configuration is not reachable; names its visit and what it breaks.
     """
-    for i, broken in enumerate(sheet.checks.reach_breaks, 1):
-        if broken:
-            raise InfeasibleError(", ".join(broken), f"visit {i} of the plan breaks it; no trajectory goes there")
+    require_reachable(sheet, "no trajectory goes there")
     return {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
         "joint_names": list(sheet.plan.joint_names),

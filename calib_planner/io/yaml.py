@@ -46,7 +46,15 @@ def read_yaml(path: str | Path, what: str) -> Node:
     Raises:
         FileFormatError: Not a text file, not YAML, or something else than a mapping.
     """
-    text = read_text(path, what)
+    return parse_yaml(read_text(path, what), path, what)
+
+
+def parse_yaml(text: str, path: str | Path, what: str) -> Node:
+    """Like ``read_yaml``, from a text that stood in the file ``path``.
+
+    Raises:
+        FileFormatError: Not YAML, or something else than a mapping.
+    """
     try:
         document = yaml.load(text, Loader=_Loader)  # a SafeLoader
     except (yaml.YAMLError, ValueError, RecursionError) as error:

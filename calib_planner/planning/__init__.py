@@ -37,5 +37,5 @@ from calib_planner.planning.problem import (
 from calib_planner.planning.random_plans import Comparison, compare, random_accuracies
 from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
-from calib_planner.planning.sheet import NEVER, PlanSheet, plan_sheet
+from calib_planner.planning.sheet import NEVER, PlanSheet, person_factors, plan_sheet
 from calib_planner.planning.tour import DWELL, PEAK, Pace, timetable, usual_pace, visiting_order
