@@ -54,7 +54,7 @@ def test_axes_in_degrees_and_the_users_template(plan_file: str, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("options", "status", "words"),
     [
-        ((), 2, ["--for", "required"]),
+        ((), 2, ["--for --template"]),
         (("--for", "rapidd"), 2, ["rapidd", "did you mean 'rapid'"]),
         (("--template", "none.j2"), 2, ["none.j2", "an existing file"]),
         (("--for", "krl", "--signs", "1 1"), 2, ["--signs", "2 numbers", "joint_a6"]),
