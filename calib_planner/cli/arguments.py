@@ -28,9 +28,16 @@ SIGMA = 3e-5
 
 
 def add_command(
-    commands: Commands, name: str, summary: str, run: Any, example: str, description: str = ""
+    commands: Commands,
+    name: str,
+    summary: str,
+    run: Any,
+    example: str,
+    description: str = "",
+    *,
+    cell: bool = True,
 ) -> argparse.ArgumentParser:
-    """A command's parser with what every command has: --json, and an example in --help."""
+    """A command's parser with what every command has: --json, --cell where it is of use, an example in --help."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
@@ -41,6 +48,9 @@ def add_command(
     )
     parser.set_defaults(run=run)
     parser.add_argument("--json", action="store_true", help="print one JSON object, in SI units and radians")
+    if cell:
+        text = "cell.yaml, written by init: options for all commands; those that are given here win"
+        parser.add_argument("--cell", metavar="FILE", help=text)
     return parser
 
 

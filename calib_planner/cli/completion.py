@@ -26,7 +26,7 @@ FOLDERS = {"DIR"}
 
 def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
-    parser = add_command(commands, "completion", summary, run, EXAMPLE, DESCRIPTION)
+    parser = add_command(commands, "completion", summary, run, EXAMPLE, DESCRIPTION, cell=False)
     parser.add_argument("shell", choices=SHELLS, help="the shell that will read the script")
 
 

@@ -21,6 +21,7 @@ from calib_planner.cli.usage import (
     refuse_unknown_options,
     refuse_unquoted_numbers,
     suggestion,
+    with_cell,
 )
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
 
@@ -108,7 +109,7 @@ def parse(words: Sequence[str], command: str) -> argparse.Namespace:
         raise SystemExit(WRONG_USAGE)
     refuse_unknown_options(top, words)
     refuse_unquoted_numbers(top, words)
-    return top.parse_args(bind_negative(words))
+    return top.parse_args(bind_negative(with_cell(top, words)))
 
 
 def _failed(json_wanted: bool, command: str, error: CalibPlannerError) -> int:

@@ -11,6 +11,7 @@ from rich.table import Table
 from calib_planner.arrays import plain
 from calib_planner.cli.arguments import Commands, add_command, add_links, add_seed
 from calib_planner.cli.terminal import Terminal
+from calib_planner.errors import InputError
 from calib_planner.io import shipped_robots
 from calib_planner.robot import Robot
 from calib_planner.units import joint_unit, joint_value, milli
@@ -20,10 +21,11 @@ EXAMPLE = "calib-planner robots show kuka_kr270"
 
 def add(commands: Commands, summary: str) -> None:
     """Add the command's parser, and those of list and show."""
-    parser = add_command(commands, "robots", summary, run_list, EXAMPLE)
+    parser = add_command(commands, "robots", summary, run_list, EXAMPLE, cell=False)
     add_seed(parser)
     actions = parser.add_subparsers(dest="action", metavar="list|show")
-    add_command(actions, "list", "list the shipped robots", run_list, "calib-planner robots list --json")
+    example = "calib-planner robots list --json"
+    add_command(actions, "list", "list the shipped robots", run_list, example, cell=False)
     show = add_command(
         actions,
         "show",
@@ -33,7 +35,8 @@ def add(commands: Commands, summary: str) -> None:
         "Show a robot's joints, parameters (the names for --parameters) and targets.\n"
         "Shown in degrees and mm; with --json in radians and m.",
     )
-    show.add_argument("robot", metavar="R", help="name of a shipped robot, robot YAML or URDF")
+    text = "name of a shipped robot, robot YAML or URDF (the cell's)"
+    show.add_argument("robot", metavar="R", nargs="?", help=text)
     add_links(show)
 
 
@@ -55,6 +58,8 @@ def run_list(args: argparse.Namespace, terminal: Terminal) -> None:
 
 def run_show(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work of show."""
+    if args.robot is None:
+        raise InputError("R", "nothing", "a robot", "give its name or file, or --cell")
     robot = Robot.load(args.robot, base_link=args.base_link, tip_link=args.tip_link)
     terminal.answer(describe(robot), lambda console: _show(robot, console))
 

@@ -71,6 +71,52 @@ def suggestion(word: str, valid: Iterable[str]) -> str:
     return f"did you mean {close[0]}?" if close else ""
 
 
+def with_cell(top: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
+    """The words with the options that the file of --cell states, unless they, or one in their place, are given.
+
+    Raises:
+        FileFormatError: The file is not a cell.
+    """
+    chain = list(_parsers(top, words))
+    command = chain[-1]
+    given = {word.split("=")[0] for word in words if word.startswith("--")}
+    path = next((_value(words, i) for i, w in enumerate(words) if w.split("=")[0] == "--cell"), "")
+    if "--cell" not in command._option_string_actions or not path:
+        return list(words)
+    from calib_planner.io import EITHER, read_cell  # NumPy and YAML, for this option alone
+
+    cell = read_cell(path)
+    either = [{f"--{key}" for key in pair} for pair in EITHER]
+    either += [
+        {f for a in g._group_actions for f in a.option_strings} for g in command._mutually_exclusive_groups
+    ]
+    taken = given.union(*(group for group in either if group & given))
+    if "--robot" in given:  # links are of the cell's robot
+        taken |= {"--base-link", "--tip-link"}
+    added: list[str] = []
+    for flag, values in cell.options().items():
+        action = command._option_string_actions.get(flag)
+        if action is None or flag in taken or action.dest != flag[2:].replace("-", "_"):
+            continue  # compensate has --targets of its own
+        added += [flag] if action.nargs == 0 else [f"{flag}={value}" for value in values]
+    for action in command._actions:
+        if action.nargs == "?" and not action.option_strings and getattr(cell, action.dest, None) is not None:
+            action.default = getattr(cell, action.dest)
+    last = max(i for i, w in enumerate(words) if any(w in _choices(p) for p in chain))
+    return [*words[: last + 1], *added, *words[last + 1 :]]
+
+
+def _value(words: Sequence[str], i: int) -> str:
+    """The value of the option in ``words[i]``; empty where there is none."""
+    _, equals, value = words[i].partition("=")
+    return value if equals else next(iter(words[i + 1 : i + 2]), "")
+
+
+def _choices(of: argparse.ArgumentParser) -> Iterable[str]:
+    """Names of the commands, or actions, below a parser."""
+    return (name for a in of._actions if isinstance(a, argparse._SubParsersAction) for name in a.choices)
+
+
 def refuse_unknown_options(top: argparse.ArgumentParser, words: Sequence[str]) -> None:
     """Refuse an option that the command does not have, and say which one is near.
 

@@ -12,6 +12,7 @@ from calib_planner.io.robots import URDF_SUFFIXES, Robot, config_folder, shipped
 
 if TYPE_CHECKING:
     from calib_planner.io.bag import BagTopics, is_bag, read_bag
+    from calib_planner.io.cell import CELL_KEYS, EITHER, Cell, read_cell, write_cell
     from calib_planner.io.conditions import read_constraints, read_instrument, read_vertical
     from calib_planner.io.csv import (
         angle_factors,
@@ -87,6 +88,7 @@ else:
         __name__,
         {
             "bag": "BagTopics is_bag read_bag",
+            "cell": "CELL_KEYS EITHER Cell read_cell write_cell",
             "conditions": "read_constraints read_instrument read_vertical",
             "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
             "read_plan_csv write_configurations write_measurements",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ import yaml
 from calib_planner.arrays import FloatArray, IntArray, frozen, plain
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io.text import read_text, write_text
-from calib_planner.units import brief
+from calib_planner.units import brief, quantity
 
 UNICODE_BREAKS = ("\x85", "\u2028", "\u2029")
 """Line breaks beyond ASCII's, which YAML reads as white space inside a text."""
@@ -32,12 +33,15 @@ T = TypeVar("T")
 def write_document(path: str | Path, kind: str, content: Mapping[str, Any], field: str = "output") -> None:
     """Write ``content`` below a line that says what it is; floats are exact to the bit."""
     document = {"format": f"calib_planner/{kind}", **plain(dict(content), keep_infinite=True, keep_nan=True)}
-    text = yaml.dump(document, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
-    if any(mark in text for mark in UNICODE_BREAKS):
-        text = yaml.dump(
-            document, Dumper=_Dumper, sort_keys=False, width=100
-        )  # escaped: YAML folds these into spaces
-    write_text(path, text, field)
+    write_text(path, yaml_text(document), field)
+
+
+def yaml_text(content: Mapping[str, Any]) -> str:
+    """Plain values as YAML that ``read_yaml`` reads back to the bit."""
+    text: str = yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    if any(mark in text for mark in UNICODE_BREAKS):  # escaped: YAML folds these into spaces
+        text = yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=100)
+    return text
 
 
 def read_yaml(path: str | Path, what: str) -> Node:
@@ -122,7 +126,9 @@ class Node:
             raise self.error(f"{type(self.value).__name__} {brief(self.value)}", expected)
         for key in self.value:
             if keys is not None and key not in keys:
-                raise self.get(key).error(f"the unknown key {brief(key)}", f"only: {names}", advice)
+                close = get_close_matches(str(key)[:100], list(keys), n=1)
+                near = f"did you mean {close[0]!r}?" if close else advice
+                raise self.get(key).error(f"the unknown key {brief(key)}", f"only: {names}", near)
         for key in required:
             if key not in self.value:
                 raise self.get(key).error(f"no key {key!r}", f"this key, of: {names}", advice)
@@ -162,6 +168,16 @@ class Node:
             advice = "a number in quotes is text: leave the quotes out" if _says_a_number(value) else ""
             raise self.refused("a finite number", advice)
         return float(value)
+
+    def quantity(self, unit: str) -> float:
+        """A finite number [unit], or a text that states one with its unit, such as ``20um``."""
+        if not isinstance(self.value, str):
+            return self.number()
+        try:
+            value = quantity(self.value, unit)
+        except ValueError as error:
+            raise self.error(brief(self.value), re.sub("^expected |, got .*", "", str(error))) from None
+        return Node(self.path, self.where, value).number()
 
     def numbers(self, length: int | None = None) -> FloatArray:
         """(length,) a list of finite numbers; at least one if ``length`` is ``None``."""

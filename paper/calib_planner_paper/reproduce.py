@@ -383,7 +383,7 @@ UNKNOWN = (
 
 def add(commands: Commands, summary: str) -> None:
     usual, example = ReproductionSettings(), "calib-planner reproduce --output results/paper"
-    parser = add_command(commands, "reproduce", summary, run, example, DESCRIPTION)
+    parser = add_command(commands, "reproduce", summary, run, example, DESCRIPTION, cell=False)
     parser.add_argument(
         "--output", default="results/paper", metavar="DIR", help="folder for the files (results/paper)"
     )

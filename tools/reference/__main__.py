@@ -13,6 +13,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+import cell
 import codes
 import command_line
 import interfaces
@@ -21,6 +22,7 @@ import parameters
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "reference"
 PAGES = {
     "command-line.md": command_line.page,
+    "cell.md": cell.page,
     "codes.md": codes.page,
     "parameters.md": parameters.page,
     "interfaces.md": interfaces.page,

@@ -1,0 +1,352 @@
+"""One file for one cell: the robot, what it carries, where the reflectors sit, the instrument, what is unknown.
+
+``cell.yaml`` says once what every command needs. Its keys are the names of the options; a value is what the
+option takes, and a length may carry its unit:
+
+    robot: irb120.urdf            # a path from this file's folder, or the name of a shipped robot
+    tip-link: tool0
+    targets: [[60mm, 20mm, 90mm]] # a row per reflector
+    unknown: base,tool
+    payload: [3.2, 0, 0, 0.05]    # kg, then m
+    mounting: ceiling
+    sigma: 20um
+    units: mm,deg                 # of data files and of angles in arguments
+
+``CELL_KEYS`` is the whole schema. ``Cell`` gives the pieces of problems; the command line takes the same values
+as options (``Cell.options``), and what is given there wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from calib_planner.error_model import ACCURACIES, ErrorModel, Payload, gravity_of, typical
+from calib_planner.io.conditions import read_constraints, read_instrument, read_vertical
+from calib_planner.io.error_model import read_error_model
+from calib_planner.io.robots import Robot, shipped_robots
+from calib_planner.io.text import user_path, write_text
+from calib_planner.io.yaml import Node, read_yaml, yaml_text
+from calib_planner.planning import Constraint
+from calib_planner.tracker import Isotropic, Noise
+
+NAMED_MODELS = ("typical", "paper")
+MOUNTINGS = ("floor", "ceiling")
+UNITS = ("mm", "deg")
+EVERYTHING_KNOWN = "none"
+"""Value of ``unknown`` for a base and targets that are as they are stated."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of the file.
+
+    Attributes:
+        read: What makes the value of ``Cell`` out of the node.
+        takes: What stands there, for people.
+        meaning: What it says.
+    """
+
+    read: Callable[[Node], Any]
+    takes: str
+    meaning: str
+
+
+# ── the kinds of values ──────────────────────────────────────────────────────────────────────────────
+
+
+def _file(node: Node) -> str:
+    """A file that is there, its path from the folder of this one."""
+    path = Path(node.path).parent / user_path(node.text())
+    if not path.is_file():
+        raise node.refused("a file that is there", "paths are from the folder of the file that names them")
+    return str(path)
+
+
+def _robot(node: Node) -> str:
+    name = node.text()
+    if name in shipped_robots():
+        return name
+    path = Path(node.path).parent / user_path(name)
+    if not path.is_file():
+        valid = f"a file that is there, or one of: {', '.join(shipped_robots())}"
+        raise node.refused(valid, "paths are from the folder of the file that names them")
+    return str(path)
+
+
+def _model(node: Node) -> str:
+    return node.text() if node.value in NAMED_MODELS else _file(node)
+
+
+def _words(node: Node) -> tuple[str, ...]:
+    """Words with commas between, or a list of them."""
+    given = node.value if isinstance(node.value, list) else node.text().split(",")
+    if not all(isinstance(word, str) and word.strip() for word in given):
+        raise node.refused("names with commas between, or a list of names")
+    return tuple(word.strip() for word in given)
+
+
+def _some_of(valid: Sequence[str]) -> Callable[[Node], tuple[str, ...]]:
+    def read(node: Node) -> tuple[str, ...]:
+        words = _words(node)
+        for word in words:
+            if word not in valid:
+                raise node.refused(f"some of: {', '.join(valid)}")
+        return words
+
+    return read
+
+
+def _items(node: Node, counts: Sequence[int] = ()) -> list[Node]:
+    """The numbers of a list, or of a text with blanks or commas between."""
+    value = node.value
+    if isinstance(value, str):
+        value = value.replace(",", " ").split()
+    items = Node(node.path, node.where, value if isinstance(value, list) else [value]).items()
+    if counts and len(items) not in counts:
+        raise node.refused(f"{' or '.join(map(str, counts))} numbers")
+    return items
+
+
+def _lengths(node: Node) -> tuple[float, ...]:
+    return tuple(item.quantity("m") for item in _items(node, (3,)))
+
+
+def _rows(read: Callable[[Node], tuple[float, ...]]) -> Callable[[Node], tuple[tuple[float, ...], ...]]:
+    """A list of rows, or a single row."""
+
+    def rows(node: Node) -> tuple[tuple[float, ...], ...]:
+        several = isinstance(node.value, list) and node.value and isinstance(node.value[0], (list, str))
+        several = several and not (isinstance(node.value[0], str) and len(_items(node.items()[0])) == 1)
+        return tuple(read(row) for row in (node.items() if several else [node]))
+
+    return rows
+
+
+def _numbers(node: Node) -> tuple[float, ...]:
+    return tuple(_plain(item).number() for item in _items(node))
+
+
+def _plain(node: Node) -> Node:
+    """A number of a row that was written as text."""
+    if not isinstance(node.value, str):
+        return node
+    try:
+        return replace(node, value=float(node.value))
+    except ValueError:
+        raise node.refused("a number") from None
+
+
+def _payload(node: Node) -> tuple[float, ...]:
+    mass, *place = _items(node, (1, 4))
+    return (mass.quantity("kg"), *(item.quantity("m") for item in place))
+
+
+def _mounting(node: Node) -> str | tuple[float, float, float]:
+    if isinstance(node.value, str) and node.value in MOUNTINGS:
+        return node.value
+    if isinstance(node.value, str) and node.value.isalpha():
+        raise node.refused(f"{', '.join(MOUNTINGS)} or a direction downwards: [x, y, z]")
+    return _direction(node)
+
+
+def _direction(node: Node) -> tuple[float, float, float]:
+    x, y, z = (_plain(item).number() for item in _items(node, (3,)))
+    if not any((x, y, z)):
+        raise node.refused("a direction that is not zero")
+    return x, y, z
+
+
+CELL_KEYS: dict[str, Key] = {
+    "robot": Key(_robot, "path, or name of a shipped robot", "URDF or robot YAML"),
+    "base-link": Key(Node.text, "name", "first link of the chain in a URDF (its root)"),
+    "tip-link": Key(Node.text, "name", "last link of the chain in a URDF (its only leaf)"),
+    "targets": Key(
+        _rows(_lengths), "[x, y, z], or a list of these [m]", "reflectors in the frame of the last link"
+    ),
+    "parameters": Key(_words, "level or names", "what is identified (the robot's own)"),
+    "unknown": Key(
+        _some_of(("base", "tool", EVERYTHING_KNOWN)), "base, tool, base,tool or none", "places that nobody knows"
+    ),
+    "payload": Key(_payload, "mass [kg], or [mass, x, y, z] [kg, m]", "what the robot carries, in the last link"),
+    "mounting": Key(_mounting, "floor, ceiling or [x, y, z]", "which way is down in the frame of the base"),
+    "vertical": Key(_direction, "[x, y, z]", "which way is up in the frame of the points, instead of mounting"),
+    "instrument": Key(_file, "path", "noise by direction, and the station"),
+    "sigma": Key(lambda node: node.quantity("m"), "length [m]", "noise of a coordinate, instead of instrument"),
+    "constraints": Key(_file, "path", "workspace, floor, the tracker's view, …"),
+    "error-model": Key(_model, "typical, paper or path", "how the robot errs; also an earlier estimate"),
+    "accuracy-frame": Key(lambda node: node.choice(ACCURACIES), "world or robot", "what an accuracy is"),
+    "required-accuracy": Key(lambda node: node.quantity("m"), "length [m]", "largest acceptable error at a pose"),
+    "test-pose": Key(_rows(_numbers), "[q1, …, qn], or a list of these [rad | m]", "where accuracy matters"),
+    "test-path": Key(_file, "path", "CSV of further test poses"),
+    "units": Key(_some_of(UNITS), "mm, deg or mm,deg", "of data files and of angles in arguments (m and rad)"),
+}
+"""Key → how it is read and what it means; the names are those of the options."""
+EITHER = (("instrument", "sigma"), ("mounting", "vertical"))
+"""Keys of which one says what the other would."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What ``cell.yaml`` says; ``None`` where it says nothing. Paths are as seen from here.
+
+    Attributes:
+        path: The file.
+        robot: Path of a URDF or robot YAML, or name of a shipped robot.
+        base_link, tip_link: The ends of the chain in a URDF.
+        targets: Rows x, y, z of the reflectors in the frame of the last link [m].
+        parameters: Names, or one level, of the parameters to be identified.
+        unknown: ``base``, ``tool``, both, or ``none``.
+        payload: Mass [kg], and where its centre of gravity is if that is said [m].
+        mounting: ``floor``, ``ceiling`` or the direction downwards in the frame of the base.
+        vertical: The direction upwards in the frame of the points.
+        instrument, constraints, test_path: Paths of files.
+        sigma: Standard deviation of a coordinate [m].
+        error_model: A name or the path of a file.
+        accuracy_frame: ``world`` or ``robot``.
+        required_accuracy: Largest acceptable error [m].
+        test_pose: Rows of joint values, in the unit that ``units`` says.
+        units: Of data files and of angles: ``mm``, ``deg`` or both; metres and radians otherwise.
+    """
+
+    path: str
+    robot: str | None = None
+    base_link: str | None = None
+    tip_link: str | None = None
+    targets: tuple[tuple[float, ...], ...] | None = None
+    parameters: tuple[str, ...] | None = None
+    unknown: tuple[str, ...] | None = None
+    payload: tuple[float, ...] | None = None
+    mounting: str | tuple[float, float, float] | None = None
+    vertical: tuple[float, float, float] | None = None
+    instrument: str | None = None
+    sigma: float | None = None
+    constraints: str | None = None
+    error_model: str | None = None
+    accuracy_frame: str | None = None
+    required_accuracy: float | None = None
+    test_pose: tuple[tuple[float, ...], ...] | None = None
+    test_path: str | None = None
+    units: tuple[str, ...] | None = None
+
+    def options(self) -> dict[str, tuple[str, ...]]:
+        """Option → the values that it would be given; without a value for one that is switched on."""
+        given: dict[str, tuple[str, ...]] = {}
+        for key in CELL_KEYS:
+            value = getattr(self, field_of(key))
+            if key == "units":
+                given |= {"--degrees": ()} if "deg" in (value or ()) else {}
+                given |= {"--millimetres": ()} if "mm" in (value or ()) else {}
+            elif key in ("targets", "test-pose") and value is not None:
+                given[f"--{key}"] = tuple(_joined(row, " ") for row in value)
+            elif value is not None:
+                given[f"--{key}"] = (_joined(value, "," if key in ("unknown", "parameters") else " "),)
+        return given
+
+    # ── the pieces of problems ───────────────────────────────────────────────────────────────────────
+
+    def load_robot(self) -> Robot:
+        """The robot with its targets and its active parameters.
+
+        Raises:
+            FileFormatError: The cell names no robot, or the robot's file cannot be used.
+            InputError: Links, targets or parameters do not fit it.
+        """
+        if self.robot is None:
+            raise Node(self.path, "robot", None).error("no such key", "this key", "name the robot")
+        robot = Robot.load(self.robot, base_link=self.base_link, tip_link=self.tip_link)
+        if self.targets is not None:
+            robot = robot.with_targets(self.targets)
+        unknown = [u for u in self.unknown or () if u != EVERYTHING_KNOWN]
+        wanted = robot.parameter_names if self.parameters is None else ",".join(self.parameters)
+        return robot.with_parameters(wanted, unknown)
+
+    def load_noise(self) -> Noise | None:
+        """The instrument; ``None`` where the cell does not say."""
+        if self.instrument is not None:
+            return read_instrument(self.instrument)
+        return None if self.sigma is None else Isotropic(self.sigma)
+
+    def load_constraints(self, robot: Robot) -> tuple[Constraint, ...]:
+        """What may be measured."""
+        return () if self.constraints is None else read_constraints(self.constraints, robot)
+
+    def load_error_model(self, robot: Robot) -> ErrorModel:
+        """How ``robot`` errs (typical, where the cell does not say), with its payload and its mounting.
+
+        Raises:
+            FileFormatError: The file cannot be used, or payload or mounting are said of a model without gravity.
+        """
+        source = self.error_model or "typical"
+        model = read_error_model(source, self.load_noise())
+        if source == "typical":
+            model = typical(self.load_noise(), gravity=gravity_of(robot))
+        if model.gravity is None:
+            for key in ("payload", "mounting", "vertical"):
+                if getattr(self, key) is not None:
+                    node = Node(self.path, key, getattr(self, key))
+                    raise node.error("a value", "an error model with gravity", "give error-model: typical")
+            return model
+        gravity, vertical = model.gravity, self.vertical
+        if self.payload is not None:
+            mass, *place = self.payload
+            x, y, z = place or (0.0, 0.0, 0.0)
+            gravity = gravity.with_payload(Payload(mass, (x, y, z)) if mass else None)
+        if vertical is None and self.mounting is None and self.instrument is not None:
+            vertical = read_vertical(self.instrument)
+        if self.mounting is not None:
+            gravity = replace(gravity, mounting=self.mounting, vertical=None)
+        elif vertical is not None:
+            gravity = replace(gravity, vertical=vertical)
+        return replace(model, gravity=gravity)
+
+
+def field_of(key: str) -> str:
+    """The field of ``Cell`` that a key of the file fills."""
+    return key.replace("-", "_")
+
+
+def _joined(value: str | float | Sequence[Any], mark: str) -> str:
+    if isinstance(value, (str, float, int)):
+        return str(value)
+    return mark.join(str(item) for item in value)
+
+
+def read_cell(path: str | Path) -> Cell:
+    """Read a cell.
+
+    Raises:
+        FileFormatError: Names the key at fault, what it holds and what is valid.
+    """
+    top = read_yaml(path, "a YAML file of a cell").mapping(CELL_KEYS)
+    for one, other in EITHER:
+        if one in top and other in top:
+            raise top[other].error(f"{one} beside it", "one of the two")
+    return Cell(str(path), **{field_of(key): CELL_KEYS[key].read(node) for key, node in top.entries()})
+
+
+def write_cell(path: str | Path, values: Mapping[str, Any], field: str = "output") -> Cell:
+    """Write a cell, with what each key means beside it.
+
+    Args:
+        path: The file.
+        values: Key → plain value, as in the file; paths are from its folder.
+        field: The argument or option that named the path, for errors.
+
+    Returns:
+        What ``read_cell`` reads from it.
+
+    Raises:
+        InputError: It cannot be written.
+        FileFormatError: A value that a cell cannot have; the file is there all the same.
+    """
+    lines = [
+        "# A cell of calib_planner: every command takes it with --cell. Paths are from this file's folder.\n"
+    ]
+    for key, meaning in CELL_KEYS.items():
+        if key in values:
+            lines.append(f"\n# {meaning.meaning}: {meaning.takes}\n{yaml_text({key: values[key]})}")
+    write_text(path, "".join(lines), field)
+    return read_cell(path)
