@@ -23,6 +23,8 @@ TYPICAL = "typical"
 """The word after --prior for the data sheet within usual manufacturing errors."""
 ERROR_MODEL = "typical"
 """How a simulated robot errs, where nothing else is said: as measured robots do."""
+KNOWN = "none"
+"""Value of --unknown for a base and targets that are as the robot and --targets say."""
 SIGMA = 3e-5
 """Standard deviation of one coordinate of a laser tracker, where nothing else is said [m]."""
 
@@ -168,7 +170,7 @@ def load_robot(args: argparse.Namespace) -> Robot:
 def choose_parameters(robot: Robot, args: argparse.Namespace) -> Robot:
     """The robot with the active parameters of ``add_parameters``."""
     request = args.parameters or robot.parameter_names
-    return robot.with_parameters(request, [u for u in args.unknown.split(",") if u.strip()])
+    return robot.with_parameters(request, [u for u in args.unknown.split(",") if u.strip() not in ("", KNOWN)])
 
 
 def test_poses(robot: Robot, args: argparse.Namespace) -> FloatArray | None:

@@ -14,6 +14,7 @@ import numpy as np
 from calib_planner.acquisition import StandstillSettings
 from calib_planner.arrays import plain
 from calib_planner.cli.arguments import (
+    KNOWN,
     TYPICAL,
     Commands,
     add_command,
@@ -176,10 +177,6 @@ def _find_unknown(robot: Robot, sources: Sources, args: argparse.Namespace, term
         )
     elif strange:
         terminal.note(f"The robot has no place for {count} reflectors: --unknown tool was taken.")
-
-
-KNOWN = "none"
-"""Value of --unknown for a base and targets that are as the robot and --targets say."""
 
 
 def _with_targets(robot: Robot, sources: Sources, args: argparse.Namespace) -> Robot:

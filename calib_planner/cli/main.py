@@ -26,6 +26,7 @@ from calib_planner.cli.usage import (
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError
 
 COMMANDS = {
+    "init": ("calib_planner.cli.init", "describe a cell once, in cell.yaml, and try it on measurements"),
     "plan": ("calib_planner.cli.plan", "choose the configurations to be measured"),
     "sheet": ("calib_planner.cli.sheet", "a plan for the person at the robot"),
     "program": ("calib_planner.cli.program", "a plan for the robot's controller"),

@@ -28,7 +28,7 @@ from calib_planner.io.conditions import read_constraints, read_instrument, read_
 from calib_planner.io.error_model import read_error_model
 from calib_planner.io.robots import Robot, shipped_robots
 from calib_planner.io.text import user_path, write_text
-from calib_planner.io.yaml import Node, read_yaml, yaml_text
+from calib_planner.io.yaml import Node, read_yaml, yaml_line
 from calib_planner.planning import Constraint
 from calib_planner.tracker import Isotropic, Noise
 
@@ -320,11 +320,15 @@ def read_cell(path: str | Path) -> Cell:
     Raises:
         FileFormatError: Names the key at fault, what it holds and what is valid.
     """
-    top = read_yaml(path, "a YAML file of a cell").mapping(CELL_KEYS)
+    return _cell(read_yaml(path, "a YAML file of a cell"))
+
+
+def _cell(top: Node) -> Cell:
+    top.mapping(CELL_KEYS)
     for one, other in EITHER:
         if one in top and other in top:
             raise top[other].error(f"{one} beside it", "one of the two")
-    return Cell(str(path), **{field_of(key): CELL_KEYS[key].read(node) for key, node in top.entries()})
+    return Cell(str(top.path), **{field_of(key): CELL_KEYS[key].read(node) for key, node in top.entries()})
 
 
 def write_cell(path: str | Path, values: Mapping[str, Any], field: str = "output") -> Cell:
@@ -340,13 +344,14 @@ def write_cell(path: str | Path, values: Mapping[str, Any], field: str = "output
 
     Raises:
         InputError: It cannot be written.
-        FileFormatError: A value that a cell cannot have; the file is there all the same.
+        FileFormatError: A value that a cell cannot have; nothing is written.
     """
+    cell = _cell(Node(path, "", dict(values)))
     lines = [
         "# A cell of calib_planner: every command takes it with --cell. Paths are from this file's folder.\n"
     ]
     for key, meaning in CELL_KEYS.items():
         if key in values:
-            lines.append(f"\n# {meaning.meaning}: {meaning.takes}\n{yaml_text({key: values[key]})}")
+            lines.append(f"\n# {meaning.meaning}: {meaning.takes}\n{yaml_line(key, values[key])}")
     write_text(path, "".join(lines), field)
-    return read_cell(path)
+    return cell

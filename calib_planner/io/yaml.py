@@ -38,9 +38,19 @@ def write_document(path: str | Path, kind: str, content: Mapping[str, Any], fiel
 
 def yaml_text(content: Mapping[str, Any]) -> str:
     """Plain values as YAML that ``read_yaml`` reads back to the bit."""
-    text: str = yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return _dumped(dict(content), flow=False)
+
+
+def yaml_line(key: str, value: Any) -> str:
+    """A key and its value, a list of numbers or of rows on one line, as far as it fits."""
+    return f"{key}: {_dumped(value, flow=True)}" if isinstance(value, list) else _dumped({key: value}, flow=False)
+
+
+def _dumped(value: Any, *, flow: bool) -> str:
+    style: dict[str, Any] = {"sort_keys": False, "width": 100, "default_flow_style": flow}
+    text: str = yaml.dump(value, Dumper=_Dumper, allow_unicode=True, **style)
     if any(mark in text for mark in UNICODE_BREAKS):  # escaped: YAML folds these into spaces
-        text = yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=100)
+        text = yaml.dump(value, Dumper=_Dumper, **style)
     return text
 
 

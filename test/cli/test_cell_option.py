@@ -72,6 +72,16 @@ def test_the_same_answer_as_with_the_options(tmp_path: Path, capsys: pytest.Capt
     assert one | {"seconds": 0} == other | {"seconds": 0}
 
 
+def test_a_cell_in_which_all_places_are_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What identify takes as "do not look for places" is nothing unknown for the others."""
+    (tmp_path / "cell.yaml").write_text("robot: planar_2r\nunknown: none\ntest-pose: [0.2, 0.9]\n")
+    assert (
+        main(["plan", "--cell", str(tmp_path / "cell.yaml"), "--configurations", "3", "--starts", "1", "--json"])
+        == 0
+    )
+    assert json.loads(capsys.readouterr().out)["parameters"] == ["l1", "l2", "dq1", "dq2"]
+
+
 def test_a_cell_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "cell.yaml").write_text("robbot: planar_2r\n")
     for path, word in (("cell.yaml", "did you mean 'robot'"), ("none.yaml", "No such file")):

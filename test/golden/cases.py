@@ -184,6 +184,7 @@ def needs_real(word: str) -> bool:
 
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
 COMMANDS = (
+    "init",
     "plan",
     "sheet",
     "campaign",
@@ -372,6 +373,7 @@ def _others() -> list[Case]:
             "sheet --plan arm_plan.yaml --robot arm.urdf --start '0 0 0 0 0 0' --speed-share 0.5 --dwell 2 "
             "--instrument config/instruments/laser_tracker.yaml",
         ),
+        Case("init", "init --robot kuka_kr270 --data kuka_points.csv --sigma 20um --mounting ceiling", ("cell.yaml",)),
         Case("robots", "robots list"),
         *(Case(f"robots_{r}", f"robots show {r}") for r in ("planar_2r", "kuka_kr270", "ur10e", "arm.urdf")),
         Case(

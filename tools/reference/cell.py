@@ -7,9 +7,10 @@ from markdown import MADE, code, escaped, joined, table
 from calib_planner.io import CELL_KEYS, EITHER
 
 INTRODUCTION = """\
-`calib-planner init` asks what a cell has and writes `cell.yaml`; every command takes it with `--cell cell.yaml`. Its
-keys are the names of the options, and options that are given beside it win. Paths are from the folder of the file. A
-length may carry its unit (`20um`, `0.02mm`). Every key may be left out; one that is not in this table is refused."""
+`calib-planner init` asks what a cell has and writes `cell.yaml`; every command takes it with `--cell cell.yaml`.
+Its keys are the names of the options, and options that are given beside it win. Paths are from the folder of the
+file. A length may carry its unit (`20um`, `0.02mm`). Every key may be left out; one that is not in this table is
+refused."""
 
 EXAMPLE = """\
 robot: irb120.urdf
