@@ -74,7 +74,7 @@ QUESTIONS = {
     "constraints": "File of constraints: workspace, floor, the tracker's view",
     "required-accuracy": "Accuracy that is needed (such as 0.1mm)",
 }
-"""Key → what is asked about it, in this order."""
+"""Key → the question about it, in this order."""
 TRIED_UNITS: tuple[tuple[str, ...], ...] = ((), ("mm",), ("deg",), ("mm", "deg"))
 """Units of a data file, in the order in which they are tried."""
 
@@ -82,7 +82,7 @@ TRIED_UNITS: tuple[tuple[str, ...], ...] = ((), ("mm",), ("deg",), ("mm", "deg")
 def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "init", summary, run, EXAMPLE, DESCRIPTION, cell=False)
-    add_robot(parser, "asked for on a terminal")
+    add_robot(parser, "a question on a terminal")
     add_parameters(parser, "told by --data")
     add_gravity(parser)
     work = parser.add_argument_group("instrument, constraints and what is wanted")
