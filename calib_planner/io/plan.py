@@ -168,7 +168,10 @@ def _row(sheet: PlanSheet, i: int, visit: dict[str, Any]) -> dict[str, Any]:
     put("visible", WORDS[visit["visible"]])
     put("breaks", "; ".join(" ".join(name.split()) for name in visit["breaks"]))
     for t in range(len(sheet.robot.targets)):
+        for axis, value in zip("xyz", sight.points[i, t], strict=True):
+            put(f"aim_{axis}{t + 1}_m", value)
         put(f"range{t + 1}_m", sight.ranges[i, t])
+        put(f"azimuth{t + 1}_rad", sight.azimuths[i, t])
         put(f"elevation{t + 1}_rad", sight.elevations[i, t])
         put(f"incidence{t + 1}_rad", sight.incidences[i, t])
     put("arrive_s", times.arrive[i])

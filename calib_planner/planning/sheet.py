@@ -33,7 +33,7 @@ from calib_planner.planning.feasibility import Constraint
 from calib_planner.planning.result import Plan
 from calib_planner.planning.tour import Pace, Timetable, timetable, usual_pace
 from calib_planner.robot import Robot
-from calib_planner.tracker import LaserTracker, Noise, distances, elevations, incidence_cosines
+from calib_planner.tracker import LaserTracker, Noise, azimuths, distances, elevations, incidence_cosines
 
 HEAD = (
     "criterion", "status", "message", "sigma", "predicted_accuracy", "lower_bound", "bound", "efficiency",
@@ -126,7 +126,9 @@ class PlanSheet:
             "reachable": bool(checks.reachable[i]),
             "visible": None if checks.visible is None else bool(checks.visible[i]),
             "breaks": checks.breaks[i],
+            "points": checks.sight.points[i],
             "ranges": checks.sight.ranges[i],
+            "azimuths": checks.sight.azimuths[i],
             "elevations": checks.sight.elevations[i],
             "incidences": checks.sight.incidences[i],
             "arrive": float(times.arrive[i]),
@@ -214,17 +216,21 @@ NEVER = ("other objects in the cell", "the moves between the visits")
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the tracker sees; NaN where that needs more than is known.
+    """Where the targets are and what the tracker sees; NaN where that needs more than is known.
 
     Attributes:
+        points: (N, targets, 3) in the frame of positions [m].
         station: (3,) in the frame of positions [m], or ``None`` if none is known, or several.
         ranges: (N, targets) [m].
+        azimuths: (N, targets) about the station's vertical, from the x axis of the frame of positions [rad].
         elevations: (N, targets) above the station's horizontal [rad].
         incidences: (N, targets) between the reflector's normal and the beam [rad].
     """
 
+    points: FloatArray
     station: FloatArray | None
     ranges: FloatArray
+    azimuths: FloatArray
     elevations: FloatArray
     incidences: FloatArray
 
@@ -299,18 +305,19 @@ def _sight(robot: Robot, q: FloatArray, constraints: Sequence[Constraint], noise
     stations = [np.asarray(c.station) for c in views]
     if isinstance(noise, LaserTracker):
         stations.append(np.asarray(noise.station))
-    unknown = np.full((len(q), len(robot.targets)), np.nan)
+    posture = robot.posture(q)
+    points, unknown = frozen(posture.targets), frozen(np.full((len(q), len(robot.targets)), np.nan))
     if not stations or any((s != stations[0]).any() for s in stations):
-        return Sight(None, frozen(unknown), frozen(unknown), frozen(unknown))
-    station, posture = stations[0], robot.posture(q)
+        return Sight(points, None, unknown, unknown, unknown, unknown)
+    station = stations[0]
     ups = [np.asarray(c.up) for c in (*views, noise) if isinstance(c, (TrackerElevation, LaserTracker))]
     normals = next((np.asarray(c.normal) for c in views if isinstance(c, ReflectorAcceptance)), None)
-    heights = incidences = np.asarray(unknown)
+    ways = heights = incidences = np.asarray(unknown)
     if ups and all(np.allclose(u, ups[0], rtol=0, atol=1e-9) for u in ups):
-        heights = elevations(station, ups[0], posture.targets)
+        ways, heights = (angles(station, ups[0], points) for angles in (azimuths, elevations))
     if normals is not None:
         turned = normals @ posture.tip_rotation.transpose(0, 2, 1)
-        cosines = incidence_cosines(station, posture.targets, turned)
+        cosines = incidence_cosines(station, points, turned)
         incidences = np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    ranges = distances(station, posture.targets)
-    return Sight(frozen(station), frozen(ranges), frozen(heights), frozen(incidences))
+    ranges = distances(station, points)
+    return Sight(points, frozen(station), frozen(ranges), frozen(ways), frozen(heights), frozen(incidences))

@@ -1,6 +1,8 @@
 """The plan sheet as one HTML page that needs nothing else: for A4 paper, and for a phone beside the robot.
 
-The page says what was checked and what was not; a cell is empty or says ``not checked`` rather than look good.
+The page begins with the visits. Above them stands only what the person can act on; what the plan promises, what
+was checked and what was not stands below them. A visit says where to set the joints and where to aim. Ticks and
+notes are remembered by the browser and can be saved as CSV.
 
 *The drawings* let a person recognise each posture. The robot is the line through base, joint origins, tip and
 reflectors, in the axes of its own base, whatever the frame of positions. The side view shows the vertical plane
@@ -28,15 +30,17 @@ from calib_planner.io import (
     write_trajectory,
 )
 from calib_planner.planning import NEVER, POSE_CRITERIA, PlanSheet
-from calib_planner.report.render import TEMPLATES, Drawing, Shape, render, shape
+from calib_planner.report.render import TEMPLATES, Drawing, Shape, embedded, render, shape
 from calib_planner.report.scene import bodies
 from calib_planner.robot import Robot
-from calib_planner.units import duration, joint_factor, joint_unit, length, signed
+from calib_planner.units import duration, joint_factor, joint_unit, length, listed, signed
 
 BOXES = 12
 """More repetitions than this get one box with their number."""
-COLUMNS = 6
+COLUMNS = 7
 """Joints beside each other; more are spread evenly over several lines."""
+BLANKS = ("date", "operator", "robot serial no.", "tracker, reflector", "temperature")
+"""What the person fills in for the whole sheet."""
 BOX, GAP, RIM, CAPTION, BEAM = 100.0, 14.0, 7.0, 10.0, 18.0
 """Height of a view, space between two, room for line widths, for text, length of beam drawn [drawing units]."""
 NARROWEST = 140.0
@@ -76,9 +80,9 @@ def write_sheet(folder: str | Path, sheet: PlanSheet, field: str = "output") -> 
 
 def sheet_page(sheet: PlanSheet) -> str:
     """The page as HTML text."""
-    turns, first = sheet.robot.joint_is_revolute, sheet.timetable.travel[0]
+    turns, first, sight = sheet.robot.joint_is_revolute, sheet.timetable.travel[0], sheet.checks.sight
     units = (("degrees, below radians", turns.any()), ("mm, below m", not turns.all()))
-    drawings = posture_drawings(sheet.robot, sheet.plan.configurations, sheet.checks.sight.station)
+    drawings = posture_drawings(sheet.robot, sheet.plan.configurations, sight.station)
     return render(
         TEMPLATES / "plan_sheet.html",
         plan=sheet.plan,
@@ -89,14 +93,27 @@ def sheet_page(sheet: PlanSheet) -> str:
         never=" and ".join(NEVER).capitalize(),
         checks=sheet.checks,
         pace=sheet.timetable.pace,
+        time=duration(sheet.timetable.seconds),
         start_known=bool(np.isfinite(first).all()),
         columns=ceil(len(turns) / ceil(len(turns) / COLUMNS)),
         units="; ".join(unit for unit, there in units if there),
+        frame=_frame(sheet.robot),
+        station=None if sight.station is None else _triple(sight.station),
+        directed=bool(np.isfinite(sight.azimuths).any()),
         rows=[_row(sheet, i, drawing) for i, drawing in enumerate(drawings)],
         side=any(s.words == "side" for s in drawings[0].shapes),
         beam=any(s.attributes.get("class") == "beam" for s in drawings[0].shapes),
         most_boxes=BOXES,
+        blanks=BLANKS,
+        embedded=embedded,
     )
+
+
+def _frame(robot: Robot) -> str:
+    """The frame of positions: the robot's base, until the robot was placed in another one."""
+    turn, place = robot.base_pose
+    at_base = np.allclose(turn, np.eye(3), rtol=0, atol=FLAT) and np.allclose(place, 0.0, rtol=0, atol=FLAT)
+    return "the robot's base frame" if at_base else "the frame of the points"
 
 
 def _facts(sheet: PlanSheet) -> Iterator[tuple[str, str, str]]:
@@ -124,12 +141,13 @@ def _facts(sheet: PlanSheet) -> Iterator[tuple[str, str, str]]:
 def _alarms(sheet: PlanSheet) -> Iterator[str]:
     plan, checks = sheet.plan, sheet.checks
     for word, mask in (("reachable", checks.reachable), ("visible", checks.visible)):
-        wrong = [] if mask is None else [str(i + 1) for i in np.flatnonzero(~mask)]
+        wrong = [] if mask is None else (np.flatnonzero(~mask) + 1).tolist()
         if wrong:
-            yield f"Not {word}: visit{'s' if len(wrong) > 1 else ''} {', '.join(wrong)}. See the rows below."
+            visits = f"visit{'s' if len(wrong) > 1 else ''} {listed(wrong)}"
+            yield f"Not {word}: {visits}. Leave out what is marked below, or plan again."
     if plan.robot != sheet.robot.name:
         yield f"The plan was made for {plan.robot}, this sheet for {sheet.robot.name}."
-    if plan.quality.status != "ok":
+    if plan.quality.status == "singular":
         yield f"{plan.quality.status}: {plan.quality.message}"
 
 
@@ -140,15 +158,12 @@ def _row(sheet: PlanSheet, i: int, drawing: Drawing) -> dict[str, Any]:
     """What the template lists of visit i."""
     plan, turns = sheet.plan, sheet.robot.joint_is_revolute
     values = zip(plan.joint_names, turns, plan.configurations[i], strict=True)
-    joint, margin = sheet.tightest()[i]
     return {
         "drawing": drawing,
         "joints": [(name, _joint(q, is_turning, 3), signed(q, 6)) for name, is_turning, q in values],
         "travel": list(_travel(sheet, i)),
-        "reach_breaks": sheet.checks.reach_breaks[i],
-        "margin": (_joint(margin, turns[joint], 1), plan.joint_names[joint]),
-        "view_breaks": None if sheet.checks.visible is None else sheet.checks.view_breaks[i],
-        "view": list(_view(sheet, i)),
+        "breaks": sheet.checks.breaks[i],
+        "aims": list(_aims(sheet, i)),
         "repetitions": int(plan.repetitions[i]),
     }
 
@@ -163,26 +178,34 @@ def _unit_of(turns: bool) -> str:
 
 
 def _travel(sheet: PlanSheet, i: int) -> Iterator[str]:
-    """Lines on the way to visit i; none if the start is not known."""
+    """The longest ways to visit i, of joints that turn and that slide; none if the start is not known."""
     if np.isnan(sheet.timetable.travel[i]).any():
         return
     for turns in (True, False):
-        count = (sheet.robot.joint_is_revolute == turns).sum()
-        for word, largest in (("max", True), ("sum", False))[:count]:  # of a single joint they are the same
-            yield f"{word} {joint_factor(turns) * sheet.total_travel(largest, turns)[i]:.1f}{_unit_of(turns)}"
+        if (sheet.robot.joint_is_revolute == turns).any():
+            yield f"{joint_factor(turns) * sheet.total_travel(True, turns)[i]:.0f}{_unit_of(turns)}"
 
 
-def _view(sheet: PlanSheet, i: int) -> Iterator[str]:
-    """Range, elevation and incidence of visit i as far as they are known: one value, or smallest … largest."""
+def _aims(sheet: PlanSheet, i: int) -> Iterator[tuple[str, str]]:
+    """Of each reflector at visit i: x, y, z in mm; and azimuth, elevation, range, incidence as far as known."""
     sight = sheet.checks.sight
-    for name, row, factor, digits, unit in (
-        ("range", sight.ranges[i], 1.0, 2, " m"),
-        ("elevation", sight.elevations[i], 180.0 / np.pi, 0, "°"),
-        ("incidence", sight.incidences[i], 180.0 / np.pi, 0, "°"),
-    ):
-        if np.isfinite(row).all():
-            ends = dict.fromkeys((signed(factor * row.min(), digits), signed(factor * row.max(), digits)))
-            yield f"{name} {'…'.join(ends)}{unit}"
+    for t, point in enumerate(sight.points[i]):
+        seen = [
+            f"{name}\u00a0{signed(factor * row[i, t], digits)}{unit}"
+            for name, row, factor, digits, unit in (
+                ("az", sight.azimuths, 180.0 / np.pi, 1, "°"),
+                ("el", sight.elevations, 180.0 / np.pi, 1, "°"),
+                ("range", sight.ranges, 1.0, 3, "\u00a0m"),
+                ("incidence", sight.incidences, 180.0 / np.pi, 0, "°"),
+            )
+            if np.isfinite(row[i, t])
+        ]
+        yield _triple(point), ", ".join(seen)
+
+
+def _triple(point: FloatArray) -> str:
+    """Coordinates (3,) [m] in whole mm: a tracker searches in a wider cone."""
+    return " ".join(f"{axis}\u00a0{signed(1e3 * x, 0)}" for axis, x in zip("xyz", point, strict=True))
 
 
 # ── the drawings ─────────────────────────────────────────────────────────────────────────────────────

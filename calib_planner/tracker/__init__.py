@@ -5,6 +5,7 @@ docs/glossary.md explains the words.
 
 from calib_planner.tracker.noise import Isotropic, LaserTracker, Noise, covariance_gradient
 from calib_planner.tracker.visibility import (
+    azimuths,
     check_direction,
     distances,
     elevations,

@@ -1,9 +1,11 @@
-"""What a tracker sees from its station: distance, elevation, incidence on the reflector, clear beams.
+"""What a tracker sees from its station: distance, azimuth, elevation, incidence on the reflector, clear beams.
 
 For a station s and a target p, the beam is b = p − s, d = |b|. With u the unit vector of the station's vertical
 axis and n the unit normal of the reflector (the axis of its cone, pointing out of it),
 
     elevation   sin ε = (b·u) / d,        −π/2 … π/2, positive above the station
+    azimuth     tan α = (b·u×e) / (b·e),  −π … π, counted about u from e, which is the x axis of the frame
+                made perpendicular to u; where both are parallel, the y axis
     incidence   cos β = (n·(s − p)) / d,  0 when the reflector looks straight at the tracker.
 
 The beam passes a capsule (all points within r of a segment) when the distance between the two segments, beam
@@ -21,6 +23,10 @@ TINY = 1e-300
 """Keeps quotients of squares finite: a direction of length zero then counts as perpendicular to all."""
 
 
+PARALLEL = 1e-6
+"""A vertical whose cosine with the x axis is nearer to 1 leaves no x direction to count from."""
+
+
 def distances(station: FloatArray, points: FloatArray) -> FloatArray:
     """(…, 3) points → (…) distances from the station [m]."""
     return np.asarray(np.linalg.norm(points - station, axis=-1))
@@ -30,6 +36,14 @@ def elevations(station: FloatArray, up: FloatArray, points: FloatArray) -> Float
     """(…, 3) points → (…) elevation angles [rad]; ``up`` is a unit vector."""
     height = (points - station) @ up
     return np.asarray(np.arcsin(np.clip(height / np.maximum(distances(station, points), TINY), -1.0, 1.0)))
+
+
+def azimuths(station: FloatArray, up: FloatArray, points: FloatArray) -> FloatArray:
+    """(…, 3) points → (…) azimuth angles [rad]; ``up`` is a unit vector."""
+    axis = np.eye(3)[int(abs(up[0]) > 1.0 - PARALLEL)]
+    ahead = axis - (axis @ up) * up
+    beam = points - station
+    return np.asarray(np.arctan2(beam @ np.cross(up, ahead), beam @ ahead))
 
 
 def incidence_cosines(station: FloatArray, points: FloatArray, normals: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ from scipy.optimize import lsq_linear
 
 from calib_planner import InputError
 from calib_planner.tracker import (
+    azimuths,
     check_direction,
     distances,
     elevations,
@@ -63,6 +64,9 @@ def test_by_hand():
     p = np.array([[4.0, 0.0, 5.0], [1.0, 0.0, -1.0], [1.0, 2.0, 1.0]])
     np.testing.assert_allclose(distances(station, p), [5, 2, 2])
     np.testing.assert_allclose(elevations(station, up, p), [np.arctan2(4, 3), -np.pi / 2, 0], atol=1e-15)
+    np.testing.assert_allclose(azimuths(station, up, p)[[0, 2]], [0.0, np.pi / 2], atol=1e-15)
+    tilted = np.array([1.0, 0.0, 0.0])  # a tracker on its side: angles count from y towards z
+    np.testing.assert_allclose(azimuths(station, tilted, p), [np.pi / 2, -np.pi / 2, 0.0], atol=1e-15)
     normals = np.array([[-1.0, 0, 0], [0, 0, 1.0], [1.0, 0, 0]])
     np.testing.assert_allclose(incidence_cosines(station, p, normals), [0.6, 1.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(shortened(station, p, 1.0)[0], [3.4, 0.0, 4.2])
