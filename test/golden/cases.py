@@ -374,7 +374,11 @@ def _others() -> list[Case]:
             "sheet --plan arm_plan.yaml --robot arm.urdf --start '0 0 0 0 0 0' --speed-share 0.5 --dwell 2 "
             "--instrument config/instruments/laser_tracker.yaml",
         ),
-        Case("init", "init --robot kuka_kr270 --data kuka_points.csv --sigma 20um --mounting ceiling", ("cell.yaml",)),
+        Case(
+            "init",
+            "init --robot kuka_kr270 --data kuka_points.csv --sigma 20um --mounting ceiling",
+            ("cell.yaml",),
+        ),
         Case("program", "program kuka_plan.yaml --for fanuc --signs '-1 1 1 1 1 -1' --output p.ls"),
         Case("robots", "robots list"),
         *(Case(f"robots_{r}", f"robots show {r}") for r in ("planar_2r", "kuka_kr270", "ur10e", "arm.urdf")),
