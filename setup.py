@@ -32,11 +32,12 @@ setup(
     # Optional: without a compiler NumPy does the same, several times slower.
     ext_modules=[
         Extension(
-            f"{NAME}.robot._kernel",
-            [f"{NAME}/robot/kernel.c"],
+            f"{NAME}.{room}._kernel",
+            [f"{NAME}/{room}/kernel.c"],
             extra_compile_args=["-O3", "-fno-math-errno", "-ffp-contract=off"],
             optional=True,
         )
+        for room in ("robot", "planning")
     ],
     package_data={NAME: ["py.typed", "report/templates/*.*"], PAPER: ["reproduction.html"]},
     data_files=[

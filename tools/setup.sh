@@ -146,7 +146,7 @@ fi
 
 # ---- 3. the package itself: editable in .venv, linked in install/ -----------------------------
 [ -f calib_planner/__init__.py ] || die "calib_planner/__init__.py is missing; this checkout is incomplete"
-package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml calib_planner/robot/kernel.c) $(files_in config launch | hash_of -) $frame_key"
+package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml calib_planner/robot/kernel.c calib_planner/planning/kernel.c) $(files_in config launch | hash_of -) $frame_key"
 if ! is_done "$ROOT/install/.stamp-package" "$package_key"; then
   say "installing calib_planner into .venv (editable)"
   run "installing calib_planner" "$VENV/bin/python" -m pip install --disable-pip-version-check \

@@ -31,7 +31,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib_planner.arrays import FloatArray, IntArray, check_array, check_number
+from calib_planner.arrays import FloatArray, IntArray, check_array, check_number, frozen
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot import Element, Robot, lumped, target_elements
@@ -176,7 +176,7 @@ class Gravity:
 
     def joints(self, robot: Robot) -> IntArray:
         """(K,) the joint of every coefficient."""
-        return np.array([j for _, j in self._pairs(robot)], np.int64)
+        return _carried(self, robot)[2][1]
 
     def moment_gradients(self, poses: Poses) -> FloatArray:
         """(N, K, joints) ∂τ/∂q [m/rad | m/m].
@@ -189,60 +189,89 @@ class Gravity:
         where both turn. A sliding k ≤ l carries joint and mass along and changes nothing, behind l it moves the
         mass by w_k; the force w_l · d along a sliding l changes as w_l is turned.
         """
-        robot, posture = poses.robot, poses.posture
-        down = robot.base_pose[0] @ self.down
-        turns, joints = robot.joint_is_revolute, len(robot.joint_names)
-        axes, order = posture.joint_axes, np.arange(joints)
-        sideways = _cross(down[None, None], axes).transpose(0, 2, 1)  # d × w_k, (N, 3, joints)
+        robot, arms = poses.robot, self._arms(poses)
+        axes, sideways = self._axes(poses)
+        turns, order = robot.joint_is_revolute, np.arange(len(robot.joint_names))
+        lever = np.where(turns[:, None, None], _cross(axes, arms), axes)  # how the mass moves with joint k
+        whole = (lever[:, :, None] * sideways[None, None]).sum(axis=3)  # lever_l · (d × w_k)
+        alone = np.swapaxes(whole, 1, 2) * turns[:, None, None]
         in_front = order[None, :] <= order[:, None]  # k ≤ l, as [l, k]
-        total: dict[str, FloatArray] = {}
-        for part in self.masses_of(robot):
-            arm = self._arms(poses, part)
-            lever = np.where(
-                turns[:, None], _cross(axes, arm), axes
-            )  # how the mass moves with joint k; τ = lever · d
-            whole = lever @ sideways * turns  # (w_k × lever_l) · d = lever_l · (d × w_k)
-            alone = sideways.transpose(0, 2, 1) @ np.swapaxes(lever, 1, 2) * turns[:, None]
-            rate = np.where(in_front, whole, alone) * part.weight
-            if part.joint is not None:
-                rate[:, part.joint + 1 :] = 0.0
-                rate[:, :, part.joint + 1 :] = 0.0
-            if part.name == PAYLOAD and poses.payload is not None and self.payload is not None:
-                rate *= poses.payload[:, None, None] / self.payload.mass
-            total[part.name] = total.get(part.name, np.zeros((len(poses), joints, joints))) + rate
-        return np.stack([total[mass][:, j] for mass, j in self._pairs(robot)], axis=1)
+        rate = np.where(in_front[..., None], whole * turns[:, None], alone)
+        load = self._loads(poses)
+        moved = (load != 0.0)[:, None] * rate * load[:, :, None]  # what a link carries no joint behind it moves
+        return np.ascontiguousarray(self._per_mass(robot, moved).transpose(2, 0, 1))
 
-    def _arms(self, poses: Poses, part: Mass) -> FloatArray:
-        """(N, joints, 3) from every joint to a part of a mass [m]; kept with the poses."""
-        key = ("arm", part)
+    def _axes(self, poses: Poses) -> tuple[FloatArray, FloatArray]:
+        """w_l and d × w_l of every joint, (joints, 3, N) each; d is downwards. Kept with the poses."""
+        axes, key = poses.posture.joint_axes.transpose(1, 2, 0), ("sideways", self)
         if key not in poses.cache:
-            points = link_points(poses.robot, poses.q, part.joint, part.xyz)
-            poses.cache[key] = points[:, None, :] - poses.posture.joint_origins
+            poses.cache[key] = _cross(self._down(poses.robot)[:, None], axes)
+        return axes, poses.cache[key]
+
+    def _down(self, robot: Robot) -> FloatArray:
+        """(3,) d, unit vector downwards in the frame of the points."""
+        return np.asarray(robot.base_pose[0] @ self.placed(robot).down)
+
+    def _loads(self, poses: Poses) -> FloatArray:
+        """(parts, joints, N or 1) weight of every part of a mass, at the joints that carry it."""
+        load = _carried(self, poses.robot)[0]
+        if poses.payload is None or self.payload is None:
+            return load
+        share = poses.payload / self.payload.mass
+        loads = np.array([part.name == PAYLOAD for part in self.masses_of(poses.robot)])
+        return np.asarray(load * np.where(loads[:, None, None], share, 1.0))
+
+    def _per_mass(self, robot: Robot, parts: FloatArray) -> FloatArray:
+        """(parts, joints, …, N) → (K, …, N): parts of a mass added up, at the joints that carry it."""
+        _, mass_of, pairs = _carried(self, robot)
+        if (count := mass_of.max() + 1) < len(mass_of):
+            sums = np.zeros((count, *parts.shape[1:]))
+            np.add.at(sums, mass_of, parts)
+            parts = sums
+        return np.asarray(parts[pairs])
+
+    def _arms(self, poses: Poses) -> FloatArray:
+        """(parts, joints, 3, N) from every joint to every part of a mass [m]; kept with the poses."""
+        key = ("arms", self)
+        if key not in poses.cache:
+            origins, tip = poses.posture.joint_origins.transpose(1, 2, 0), poses.posture.tip_origin.T
+            points = []
+            for part in self.masses_of(poses.robot):
+                at = tip if part.joint is None else origins[part.joint]
+                known = any(part.xyz)
+                points.append(link_points(poses.robot, poses.q, part.joint, part.xyz).T if known else at)
+            poses.cache[key] = np.stack(points)[:, None] - origins
         return poses.cache[key]
 
     def moments(self, poses: Poses) -> FloatArray:
         """(N, K) τ [m], or the force along a sliding joint, of a unit weight."""
-        robot, posture = poses.robot, poses.posture
-        down = robot.base_pose[0] @ self.placed(robot).down
-        turns, joints = robot.joint_is_revolute, len(robot.joint_names)
-        total: dict[str, FloatArray] = {}
-        for part in self.masses_of(robot):
-            turning = _cross(posture.joint_axes, self._arms(poses, part)) @ down
-            felt = np.where(turns, turning, posture.joint_axes @ down) * part.weight
-            if part.joint is not None:
-                felt[:, part.joint + 1 :] = 0.0
-            if part.name == PAYLOAD and poses.payload is not None and self.payload is not None:
-                felt *= poses.payload[:, None] / self.payload.mass
-            total[part.name] = total.get(part.name, np.zeros((len(poses), joints))) + felt
-        return np.stack([total[mass][:, j] for mass, j in self._pairs(robot)], axis=1)
+        robot, (axes, sideways) = poses.robot, self._axes(poses)
+        turning = (self._arms(poses) * sideways).sum(axis=2)  # (w × arm) · d = arm · (d × w)
+        pull = np.einsum("x,lxn->ln", self._down(robot), axes)
+        felt = np.where(robot.joint_is_revolute[:, None], turning, pull) * self._loads(poses)
+        return np.ascontiguousarray(self._per_mass(robot, felt).T)
+
+
+@lru_cache(maxsize=64)
+def _carried(gravity: Gravity, robot: Robot) -> tuple[FloatArray, IntArray, tuple[IntArray, IntArray]]:
+    """Weights (parts, joints, 1) at the joints that carry them, the number of each part's mass in the order of
+    the coefficients, and (mass, joint) of every coefficient."""
+    parts, pairs = gravity.masses_of(robot), gravity._pairs(robot)
+    joints, names = np.arange(len(robot.joint_names)), list(dict.fromkeys(part.name for part in parts))
+    rows = [part.weight * (joints <= (len(joints) if part.joint is None else part.joint)) for part in parts]
+    mass_of = np.array([names.index(part.name) for part in parts], np.int64)
+    chosen = np.array([[names.index(mass), joint] for mass, joint in pairs], np.int64).T
+    return frozen(np.array(rows, float)[:, :, None]), mass_of, (chosen[0], chosen[1])
 
 
 def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Cross product over the last axis; ``np.cross`` takes three times as long for few of them."""
-    x = u[..., 1] * v[..., 2] - u[..., 2] * v[..., 1]
-    y = u[..., 2] * v[..., 0] - u[..., 0] * v[..., 2]
-    z = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return np.stack([x, y, z], axis=-1)
+    """Cross product over the axis before the last; the other axes broadcast."""
+    x = u[..., 1, :] * v[..., 2, :] - u[..., 2, :] * v[..., 1, :]
+    result: FloatArray = np.empty((*x.shape[:-1], 3, x.shape[-1]))
+    result[..., 0, :] = x
+    np.subtract(u[..., 2, :] * v[..., 0, :], u[..., 0, :] * v[..., 2, :], out=result[..., 1, :])
+    np.subtract(u[..., 0, :] * v[..., 1, :], u[..., 1, :] * v[..., 0, :], out=result[..., 2, :])
+    return result
 
 
 def gravity_of(robot: Robot) -> Gravity:

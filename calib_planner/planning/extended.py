@@ -20,6 +20,12 @@ concave in the design as before, so search, bound and proof stay. Two configurat
 *Gradient.* With G = ∂Ψ/∂M, Z = V⁻¹X G, K = Z Xᵀ V⁻¹: dΨ = 2 tr(Zᵀ dX) − tr(K dV). What X and V depend on are J
 and c_l, which ``Linearisation.pull_back`` takes to the joints, τ and Φ.
 
+*Other sizes.* Where gravity, joint functions and repeatability are f times as large (``scaled``), X turns into
+X D_f, D_f being 1 for the robot's parameters and f for the rest, and V = N + S into N + f² S, S being what the
+errors of the joints make of it and N the rest. So X, N and S are computed once for all f, and the gradients of
+several f go back to the joints as one sum: 2 Σ_f (V_f⁻¹X) D_f G_f D_f is ∂Ψ/∂X, and −Σ_f K_f and −Σ_f f² K_f are
+∂Ψ/∂N and ∂Ψ/∂S.
+
 *Bound.* A gradient G of Ψ at M has the gradient L G Lᵀ on all coefficients, L = [I; −Θ] being the elimination at
 the design ξ: Θ_l = Σ_j (I − U_lU_lᵀ) Φ_l(q_j)ᵀ c_l(q_j)ᵀ (V_ξ⁻¹X)_j. So (B) of ``criteria`` reads
 
@@ -34,7 +40,8 @@ n real ones cannot, so that the best plan stays below the bound by as much.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,10 +51,19 @@ from calib_planner.error_model import ErrorModel, JointFunctions, Poses, joint_u
 from calib_planner.robot import Layout, Linearisation, Robot
 from calib_planner.tracker import Isotropic, Noise, covariance_gradient
 
+try:
+    import calib_planner.planning._kernel as _kernel  # type: ignore[import-not-found]
+except ImportError:  # not built: NumPy does the same, more slowly
+    _kernel = None
+
 SLOW = 3
 """Waves per turn that stay coefficients whatever the test poses: what the rest of the workspace feels most."""
 FELT_WAVES = 12
 """Further functions of each joint's angle that stay: those that the test poses feel."""
+UNCERTAIN = ("gravity", "smooth.size", "short.size", "repeatability")
+"""Scales of the errors of the joints: a plan does not trust them until an estimate has taught them."""
+SMALL = 24
+"""Up to so many equations a run, NumPy factors all runs in one call faster than LAPACK each of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +78,7 @@ class ExtendedModel:
         basis: (joints, F, b) U_l.
         maps: (joints, F, p) how Φ_l enters the columns: U_l in its place, or less Θ_l.
         coupled: Whether configurations share κ_l; not so in (2).
+        factor: f, by which the errors of the joints are larger than in the model that this one was scaled from.
     """
 
     robot: Robot
@@ -71,6 +88,7 @@ class ExtendedModel:
     basis: FloatArray
     maps: FloatArray
     coupled: bool = True
+    factor: float = 1.0
 
     @staticmethod
     def of(
@@ -84,6 +102,16 @@ class ExtendedModel:
         for joint in range(joints):
             maps[joint, :, start + joint * b : start + (joint + 1) * b] = basis[joint]
         return ExtendedModel(robot, model, repetitions, configuration_sigma, basis, maps)
+
+    def scaled(self, factor: float) -> ExtendedModel:
+        """The same robot with errors of its joints that are ``factor`` times as large."""
+        values = {name: value * factor for name, value in self.model.values.items() if name in UNCERTAIN}
+        model = self.model.with_values(values, name="scaled")
+        return replace(self, model=model, factor=self.factor * factor)
+
+    def column_scales(self, factor: float) -> FloatArray:
+        """(p,) diagonal of D_f: what ``scaled`` makes of the columns X."""
+        return np.where(np.arange(self.size) < len(self.robot.parameter_names), 1.0, factor)
 
     @property
     def noise(self) -> Noise:
@@ -107,6 +135,34 @@ class ExtendedModel:
         """That of the chain with the joints in the place of the parameters, to pull levers back."""
         chain = self.robot.linearise(np.zeros((1, len(self.robot.joint_names)))).layout
         return replace(chain, parameter_elements=chain.joint_elements, parameter_rotates=chain.joint_rotates)
+
+    @cached_property
+    def wave_scales(self) -> FloatArray:
+        """(F,) standard deviation of each wave of a joint function [rad]."""
+        functions = self.model.joint_functions
+        if functions is None:
+            return np.zeros(0)
+        return np.sqrt(functions.variances(self.robot, self.model.values)[: 2 * functions.harmonics])
+
+    @cached_property
+    def visit_variance(self) -> float:
+        """Variance of what each joint errs anew at each configuration, repeated as wanted [rad²]."""
+        visits = self.model.visits
+        if visits is None or not visits.joints:
+            return 0.0
+        return self.model.values["repeatability"] ** 2 / self.repetitions
+
+    @cached_property
+    def still(self) -> ErrorModel:
+        """The error model without what the joints err anew at each visit."""
+        visits = self.model.visits
+        return self.model if visits is None else replace(self.model, visits=replace(visits, joints=False))
+
+    @cached_property
+    def gravity_joints(self) -> FloatArray:
+        """(K, joints) 1 where a coefficient of gravity acts at a joint, else 0."""
+        gravity, joints = self.model.gravity, len(self.robot.joint_names)
+        return np.zeros((0, joints)) if gravity is None else np.eye(joints)[gravity.joints(self.robot)]
 
     def linearised(self, q: FloatArray) -> LinearisedExtension:
         """The columns at ``q`` (N, joints) with what their gradient needs."""
@@ -141,6 +197,7 @@ class LinearisedExtension:
 
     model: ExtendedModel
     poses: Poses
+    _runs: dict[tuple[int, float], tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
     @cached_property
     def levers(self) -> FloatArray:
@@ -150,7 +207,7 @@ class LinearisedExtension:
     @cached_property
     def features(self) -> tuple[FloatArray, FloatArray]:
         """Φ_l and dΦ_l/dq_l, (N, joints, F) each."""
-        return joint_features(self.model.robot, self.model.model, self.poses.q)
+        return joint_features(self.model, self.poses)
 
     @cached_property
     def explicit(self) -> tuple[FloatArray, FloatArray]:
@@ -166,18 +223,22 @@ class LinearisedExtension:
     @cached_property
     def jacobian(self) -> FloatArray:
         """(N, 3·targets, p) X."""
-        robot, model = self.model.robot, self.model.model
-        count = len(robot.parameter_names)
+        count, gravity = len(self.model.robot.parameter_names), self.model.model.gravity
         if self.model.coupled:
-            result: FloatArray = np.zeros((*self.levers.shape[:2], self.model.size))
+            result: FloatArray = np.empty((*self.levers.shape[:2], self.model.size))
             n, rows, _ = result.shape
-            pushes = self.levers[..., None] * self.explicit[0][:, None]
-            result[:, :, self.model.first :] = pushes.reshape(n, rows, -1)
-        else:
-            result = self.levers @ _through(self.features[0], self.model.maps)
+            result[:, :, :count] = self.poses.jacobian
+            if gravity is not None:
+                np.multiply(
+                    self._gravity_levers, self.moments[:, None], out=result[:, :, count : self.model.first]
+                )
+            joints = result[:, :, self.model.first :].reshape(n, rows, len(self.model.basis), -1)
+            np.multiply(self.levers[..., None], self.explicit[0][:, None], out=joints)
+            return result
+        result = self.levers @ _through(self.features[0], self.model.maps)
         result[:, :, :count] += self.poses.jacobian
-        if model.gravity is not None:
-            pushes = self.levers[:, :, model.gravity.joints(robot)] * self.moments[:, None, :]
+        if gravity is not None:
+            pushes = self._gravity_levers * self.moments[:, None]
             result[:, :, count : count + pushes.shape[2]] += pushes
         return np.asarray(result)
 
@@ -189,58 +250,93 @@ class LinearisedExtension:
         return gravity.moments(self.poses) * values["gravity"]
 
     @cached_property
-    def own(self) -> FloatArray:
-        """(N, 3·targets, 3·targets) R: what is new at each visit and point [m²]."""
-        r = self.model.model.visit_covariance(self.poses) / self.model.repetitions
+    def _gravity_levers(self) -> FloatArray:
+        """(N, 3·targets, K) the lever of each coefficient of gravity."""
+        gravity = self.model.model.gravity
+        assert gravity is not None
+        return self.levers[:, :, gravity.joints(self.model.robot)]
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """(N, 3·targets, 3·targets) what is new at each visit and point, without the joints' part [m²]."""
+        r = self.model.still.visit_covariance(self.poses) / self.model.repetitions
         return np.asarray(r + self.model.configuration_sigma**2 * np.eye(r.shape[-1]))
 
-    def kernels(self, size: int) -> FloatArray:
-        """(joints, N/size, size, size) κ_l within each run of ``size`` configurations."""
-        n, joints, waves = self.rest.shape
-        runs = self.rest.reshape(n // size, size, joints, waves).transpose(2, 0, 1, 3)
-        return np.asarray(runs @ np.swapaxes(runs, 2, 3))
+    def kernels(self, size: int, counts: FloatArray | None = None) -> FloatArray:
+        """(joints, N/size, size, size) what the errors of a joint have in common within each run.
+
+        That is κ_l, and for a configuration with itself the variance of what is new at a visit, divided by
+        ``counts`` (N,) if given.
+        """
+        n, joints, _ = self.rest.shape
+        every, own = np.arange(size), np.full(n, self.model.visit_variance)
+        if self.model.coupled:
+            runs = _by_joint(self.rest, size)
+            result = runs @ np.swapaxes(runs, 2, 3)
+        else:
+            result = np.zeros((joints, n // size, size, size))
+        result[:, :, every, every] += (own if counts is None else own / counts).reshape(-1, size)
+        return np.asarray(result)
 
     def stacked(self, size: int) -> FloatArray:
         """(N/size, 3·targets·size, p) X of each run."""
         n, rows, p = self.jacobian.shape
         return self.jacobian.reshape(n // size, size * rows, p)
 
-    def covariance(self, size: int, counts: FloatArray | None = None) -> FloatArray:
-        """(N/size, 3·targets·size, …) V of each run; R divided by ``counts`` (N,) if given."""
-        n, rows, _ = self.own.shape
-        own = self.own if counts is None else self.own / counts[:, None, None]
-        result = np.zeros((n // size, size, rows, size, rows))
-        every = np.arange(size)
-        result[:, every, :, every, :] = np.moveaxis(own.reshape(n // size, size, rows, rows), 1, 0)
-        flat = result.reshape(n // size, size * rows, size * rows)
-        if self.model.coupled:
-            for lever, kernel in zip(self._stacked_levers(size), self.kernels(size), strict=True):
-                flat += lever[:, :, None] * lever[:, None, :] * _spread(kernel, rows)
-        return flat
+    def covariance(self, size: int, counts: FloatArray | None = None, factor: float = 1.0) -> FloatArray:
+        """(N/size, 3·targets·size, …) V of each run.
 
-    def _stacked_levers(self, size: int) -> FloatArray:
-        """(joints, N/size, 3·targets·size)."""
-        n, rows, joints = self.levers.shape
-        return np.ascontiguousarray(self.levers.reshape(n // size, size * rows, joints).transpose(2, 0, 1))
+        Args:
+            size: Configurations in a run.
+            counts: (N,) measurements at each configuration, which divide what is new at each of them.
+            factor: f.
+        """
+        n, rows, _ = self.points.shape
+        points = self.points if counts is None else self.points / counts[:, None, None]
+        result = self._coupling(size) if counts is None else couple(self.levers, self.kernels(size, counts))
+        result = result * factor**2
+        blocks = result.reshape(n // size, size, rows, size, rows)
+        every = np.arange(size)
+        blocks[:, every, :, every, :] += np.moveaxis(points.reshape(n // size, size, rows, rows), 1, 0)
+        return result
 
     @cached_property
-    def _solved(self) -> dict[int, FloatArray]:
+    def _couplings(self) -> dict[int, tuple[FloatArray, FloatArray]]:
         return {}
+
+    def _coupling(self, size: int) -> FloatArray:
+        """(N/size, 3·targets·size, …) S of each run."""
+        if size not in self._couplings:
+            kernels = self.kernels(size)
+            self._couplings[size] = kernels, couple(self.levers, kernels)
+        return self._couplings[size][1]
+
+    def _solved(self, size: int, factor: float) -> tuple[FloatArray, FloatArray]:
+        """(N/size, 3·targets·size, p) L⁻¹X and V⁻¹X of each run, V = L Lᵀ at f = ``factor``."""
+        key = size, factor
+        if key not in self._runs:
+            self._runs[key] = _solve(self.covariance(size, factor=factor), self.stacked(size))
+        return self._runs[key]
 
     def solved(self, size: int) -> FloatArray:
         """(N/size, 3·targets·size, p) V⁻¹X of each run."""
-        if size not in self._solved:
-            self._solved[size] = np.asarray(np.linalg.solve(self.covariance(size), self.stacked(size)), float)
-        return self._solved[size]
+        return self._solved(size, 1.0)[1]
 
-    def sums(self, size: int) -> FloatArray:
-        """(N/size, p, p) XᵀV⁻¹X of each run of ``size`` configurations."""
-        return np.asarray(np.swapaxes(self.stacked(size), 1, 2) @ self.solved(size))
+    def sums(self, size: int, factor: float = 1.0) -> FloatArray:
+        """(N/size, p, p) XᵀV⁻¹X of each run of ``size`` configurations, of the model ``scaled`` by ``factor``."""
+        white = self._solved(size, factor)[0]
+        result = (
+            np.stack([run.T @ run for run in white]) if len(white) < SMALL else np.swapaxes(white, 1, 2) @ white
+        )
+        if factor != 1.0:
+            scales = self.model.column_scales(factor)
+            result *= scales[:, None] * scales
+        return np.asarray(result)
 
     def rows(self, chosen: IntArray) -> LinearisedExtension:
         """The configurations with these numbers (m,)."""
         part = LinearisedExtension(self.model, Poses(self.model.robot, self.poses.q[chosen]))
-        for name in ("levers", "own", "jacobian", "rest"):
+        for name in ("levers", "points", "jacobian", "rest"):
             part.__dict__[name] = getattr(self, name)[chosen]
         part.__dict__["features"] = tuple(each[chosen] for each in self.features)
         return part
@@ -252,14 +348,12 @@ class LinearisedExtension:
             (N, 3·targets, p) rows with M(others and q_i) = M(others) + rowsᵀ rows.
         """
         alone, left = self.covariance(1), self.jacobian
-        m = len(others.own)
+        m = len(others.points)
         if m:
-            n, r, joints = self.levers.shape
-            cross = np.zeros((n * r, m * r))
-            both = zip(self._stacked_levers(1), others._stacked_levers(m), range(joints), strict=True)
-            for own, lever, joint in both:
-                kernel = self.rest[:, joint] @ others.rest[:, joint].T
-                cross += own.reshape(-1, 1) * lever * np.repeat(np.repeat(kernel, r, axis=0), r, axis=1)
+            n, r, _ = self.levers.shape
+            kernels = self.rest.transpose(1, 0, 2) @ others.rest.transpose(1, 2, 0)
+            cross = np.einsum("nrl,lnm,msl->nrms", self.levers, kernels, others.levers, optimize=True)
+            cross = cross.reshape(n * r, m * r)
             weights: FloatArray = np.linalg.solve(others.covariance(m)[0], cross.T).T
             left = left - (weights @ others.stacked(m)[0]).reshape(left.shape)
             alone = alone - weights.reshape(n, r, -1) @ np.swapaxes(cross.reshape(n, r, -1), 1, 2)
@@ -277,14 +371,14 @@ class LinearisedExtension:
     def as_seen_by(self, model: ExtendedModel) -> LinearisedExtension:
         """The same configurations in a model that differs in ``maps`` and coupling."""
         seen = LinearisedExtension(model, self.poses)
-        for name in ("levers", "features", "own"):
+        for name in ("levers", "features", "points"):
             seen.__dict__[name] = getattr(self, name)
         return seen
 
     @cached_property
     def whitened(self) -> FloatArray:
         """(N, 3·targets, p) rows of each configuration alone, rowsᵀ rows = ``sums(1)``."""
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(self.covariance(1)), self.jacobian))
+        return self._solved(1, 1.0)[0]
 
     @property
     def weighted(self) -> FloatArray:
@@ -293,28 +387,33 @@ class LinearisedExtension:
 
     def gradient(self, gradients: FloatArray) -> FloatArray:
         """∂Ψ/∂q (N, joints) for G (N/size, p, p), each serving a run of ``size`` configurations."""
+        return self.gradient_of_sum([(1.0, gradients)])
+
+    def gradient_of_sum(self, parts: Sequence[tuple[float, FloatArray]]) -> FloatArray:
+        """∂/∂q (N, joints) of a sum of Ψ_f: (f, ∂Ψ_f/∂M (N/size, p, p)), M being of the model ``scaled`` by f."""
         n, rows, p = self.jacobian.shape
-        size, robot, model = n // len(gradients), self.model.robot, self.model.model
-        solved = self.solved(size)
-        z = solved @ gradients
-        force = 2.0 * z.reshape(n, rows, p)  # ∂Ψ/∂X
-        k = z @ np.swapaxes(solved, 1, 2)
+        size, robot, model = n // len(parts[0][1]), self.model.robot, self.model.model
+        force: FloatArray = np.zeros((len(parts[0][1]), size * rows, p))
+        on_points, on_joints = (np.zeros((len(force), size * rows, size * rows)) for _ in range(2))
+        for factor, by_matrix in parts:
+            solved, scales = self._solved(size, factor)[1], self.model.column_scales(factor)
+            z = solved @ (by_matrix * scales[:, None] * scales)
+            k = z @ np.swapaxes(solved, 1, 2)
+            force += z
+            on_points += k
+            on_joints += factor**2 * k
+        force *= 2.0  # ∂Ψ/∂X
+        force = force.reshape(n, rows, p)
         by_lever, by_joint = self._by_functions(force)
         count = len(robot.parameter_names)
         if model.gravity is not None:
-            joints = model.gravity.joints(robot)
-            own = force[:, :, count : count + len(joints)]
-            np.add.at(by_lever.transpose(2, 0, 1), joints, (own * self.moments[:, None, :]).transpose(2, 0, 1))
+            own = force[:, :, count : count + self.moments.shape[1]]
+            by_lever += (own * self.moments[:, None]) @ self.model.gravity_joints
             rates = model.gravity.moment_gradients(self.poses) * model.values["gravity"]
-            by_joint += np.einsum("nk,nkj->nj", np.sum(own * self.levers[:, :, joints], axis=1), rates)
-        if self.model.coupled:
-            self._add_kernels(k, size, by_lever, by_joint)
-        blocks = _diagonal(k, size, rows)
-        if model.visits is not None and model.visits.joints:
-            factor = -2.0 * model.values["repeatability"] ** 2 / self.model.repetitions
-            by_lever += factor * (blocks @ self.levers)
-        self._add_noise(blocks, by_joint)
-        return by_joint + self._pulled(force[:, :, :count], by_lever)
+            by_joint += (np.sum(own * self._gravity_levers, axis=1)[:, None] @ rates)[:, 0]
+        self._add_kernels(on_joints, size, by_lever, by_joint)
+        self._add_noise(on_points, size, by_joint)
+        return by_joint + self._pulled(force, by_lever)
 
     def _by_functions(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """∂Ψ/∂c_l (N, 3·targets, joints) and ∂Ψ/∂q (N, joints) through Φ_l in X."""
@@ -330,25 +429,22 @@ class LinearisedExtension:
         return np.asarray(by_lever), np.sum(pushed * rates, axis=2)
 
     def _add_kernels(self, k: FloatArray, size: int, by_lever: FloatArray, by_joint: FloatArray) -> None:
-        """−tr(K dV) through κ_l and the levers beside it, added in place."""
-        n, rows, joints = self.levers.shape
-        runs = n // size
-        rates = self.features[1].reshape(runs, size, joints, -1).transpose(2, 0, 1, 3)
-        rest = self.rest.reshape(runs, size, joints, -1).transpose(2, 0, 1, 3)
-        by_angle, kernels = rates @ np.swapaxes(rest, 2, 3), self.kernels(size)
-        for joint, lever in enumerate(self._stacked_levers(size)):
-            pulled = (k * _spread(kernels[joint], rows)) @ lever[:, :, None]
-            by_lever[:, :, joint] -= 2.0 * pulled.reshape(n, rows)
-            met = (
-                (k * lever[:, :, None] * lever[:, None, :]).reshape(runs, size, rows, size, rows).sum(axis=(2, 4))
+        """−tr(K dS) through κ_l and the levers beside it, added in place."""
+        self._coupling(size)
+        kernels = self._couplings[size][0]
+        changes = np.zeros(kernels.shape)
+        if self.model.coupled:
+            np.matmul(
+                _by_joint(self.features[1], size), np.swapaxes(_by_joint(self.rest, size), 2, 3), out=changes
             )
-            by_joint[:, joint] -= 2.0 * np.sum(met * by_angle[joint], axis=2).reshape(n)
+        couple_back(self.levers, kernels, changes, k, by_lever, by_joint)
 
-    def _add_noise(self, blocks: FloatArray, by_joint: FloatArray) -> None:
-        """−tr(K dR) through the instrument's covariance, which depends on the point; added in place."""
+    def _add_noise(self, k: FloatArray, size: int, by_joint: FloatArray) -> None:
+        """−tr(K dN) through the instrument's covariance, which depends on the point; added in place."""
         points = self.model.model.points
         if points.noise is None or isinstance(points.noise, Isotropic):
             return
+        blocks = _diagonal(k, size, self.jacobian.shape[1])
         n, targets = len(blocks), len(self.model.robot.targets)
         own = blocks.reshape(n, targets, 3, targets, 3)[:, np.arange(targets), :, np.arange(targets), :]
         scale = self.model.model.values.get("instrument", 1.0) ** 2 / self.model.repetitions
@@ -358,36 +454,128 @@ class LinearisedExtension:
 
     def _pulled(self, by_jacobian: FloatArray, by_lever: FloatArray) -> FloatArray:
         """(N, joints) ∂Ψ/∂q through J and c_l."""
-        lin, targets = self.poses.linearisation, len(self.model.robot.targets)
-
-        def shaped(weights: FloatArray) -> FloatArray:
-            n, _, p = weights.shape
-            return np.ascontiguousarray(weights.transpose(2, 1, 0)).reshape(p, targets, 3, n)
-
+        lin = self.poses.linearisation
         levers = Linearisation(
             lin.points, lin.joint_columns, lin.joint_columns, lin.joint_axes, lin.joint_axes, self.model.layout
         )
-        result = levers.pull_back(shaped(by_lever * joint_units(self.model.robot)))
-        return result + lin.pull_back(shaped(by_jacobian)) if by_jacobian.shape[2] else result
+        result = levers.pull_back(by_lever * joint_units(self.model.robot))
+        return result + lin.pull_back(by_jacobian) if len(lin.columns) else result
+
+
+# ── runs of configurations ───────────────────────────────────────────────────────────────────────────
+
+
+def _solve(matrices: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """L⁻¹B and V⁻¹B (S, n, p) for V = L Lᵀ (S, n, n) and B (S, n, p)."""
+    roots = np.linalg.cholesky(matrices)
+    if roots.shape[1] <= SMALL:
+        inverse = np.linalg.inv(roots)
+        half = inverse @ right
+        return half, np.swapaxes(inverse, 1, 2) @ half
+    from scipy.linalg.blas import dtrsm  # the transposes of C-ordered arrays are what BLAS takes without a copy
+
+    half, solved = np.empty(right.shape), np.empty(right.shape)
+    for root, given, first, second in zip(roots, right, half, solved, strict=True):
+        first[:] = dtrsm(1.0, root.T, given.T, side=1).T
+        second[:] = dtrsm(1.0, root.T, first.T, side=1, trans_a=1).T
+    return half, solved
+
+
+def couple(levers: FloatArray, kernels: FloatArray) -> FloatArray:
+    """Σ_l c_l(q_i) κ_l(i, j) c_l(q_j)ᵀ of each run of m configurations.
+
+    Args:
+        levers: (N, rows, joints), N = S·m.
+        kernels: (joints, S, m, m), symmetric in the last two.
+
+    Returns:
+        (S, m·rows, m·rows).
+    """
+    if _kernel is None or not levers.flags.c_contiguous:
+        return couple_numpy(levers, kernels)
+    _, runs, size, _ = kernels.shape
+    out = np.empty((runs, size * levers.shape[1], size * levers.shape[1]))
+    _kernel.couple(levers, np.ascontiguousarray(kernels), out)
+    return out
+
+
+def couple_numpy(levers: FloatArray, kernels: FloatArray) -> FloatArray:
+    """``couple`` without the compiled kernel."""
+    _, rows, joints = levers.shape
+    _, runs, size, _ = kernels.shape
+    result: FloatArray = np.zeros((runs, size * rows, size * rows))
+    for lever, kernel in zip(levers.reshape(runs, size * rows, joints).transpose(2, 0, 1), kernels, strict=True):
+        result += lever[:, :, None] * lever[:, None, :] * _spread(kernel, rows)
+    return result
+
+
+def couple_back(
+    levers: FloatArray,
+    kernels: FloatArray,
+    changes: FloatArray,
+    weights: FloatArray,
+    by_lever: FloatArray,
+    by_joint: FloatArray,
+) -> None:
+    """−tr(K dS) with S of ``couple``, added in place.
+
+    Args:
+        levers: As in ``couple``.
+        kernels: As in ``couple``.
+        changes: (joints, S, m, m) derivative of κ_l(i, j) by joint l of configuration i.
+        weights: (S, m·rows, m·rows) K, symmetric.
+        by_lever: (N, rows, joints) ∂/∂c_l.
+        by_joint: (N, joints) ∂/∂q_l.
+    """
+    if _kernel is None or not (levers.flags.c_contiguous and by_lever.flags.c_contiguous):
+        couple_back_numpy(levers, kernels, changes, weights, by_lever, by_joint)
+        return
+    kernels, changes, weights = (np.ascontiguousarray(a) for a in (kernels, changes, weights))
+    _kernel.couple_back(levers, kernels, changes, weights, by_lever, by_joint)
+
+
+def couple_back_numpy(
+    levers: FloatArray,
+    kernels: FloatArray,
+    changes: FloatArray,
+    weights: FloatArray,
+    by_lever: FloatArray,
+    by_joint: FloatArray,
+) -> None:
+    """``couple_back`` without the compiled kernel."""
+    n, rows, joints = levers.shape
+    _, runs, size, _ = kernels.shape
+    for joint, lever in enumerate(levers.reshape(runs, size * rows, joints).transpose(2, 0, 1)):
+        pulled = (weights * _spread(kernels[joint], rows)) @ lever[:, :, None]
+        by_lever[:, :, joint] -= 2.0 * pulled.reshape(n, rows)
+        met = (
+            (weights * lever[:, :, None] * lever[:, None, :])
+            .reshape(runs, size, rows, size, rows)
+            .sum(axis=(2, 4))
+        )
+        by_joint[:, joint] -= 2.0 * np.sum(met * changes[joint], axis=2).reshape(n)
 
 
 # ── joint functions ──────────────────────────────────────────────────────────────────────────────────
 
 
-def joint_features(robot: Robot, model: ErrorModel, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def joint_features(model: ExtendedModel, poses: Poses) -> tuple[FloatArray, FloatArray]:
     """Φ_l(q_l) and dΦ_l/dq_l (N, joints, F), F = 0 where the model has no joint functions."""
-    functions = model.joint_functions
+    functions, robot = model.model.joint_functions, model.robot
     if functions is None:
-        nothing = np.zeros((*q.shape, 0))
+        nothing = np.zeros((*poses.q.shape, 0))
         return nothing, nothing
-    low, high = robot.joint_limits.T
-    waves = functions.waves(Poses(robot, q))
-    orders = np.arange(1, functions.harmonics + 1)
-    half = functions.harmonics
-    rates = np.concatenate([-waves[..., half:] * orders, waves[..., :half] * orders], axis=2)
-    rates *= np.where(robot.joint_is_revolute, 1.0, np.pi / (high - low))[:, None]
-    scale = np.sqrt(functions.variances(robot, model.values)[: 2 * half])
-    return waves * scale, rates * scale
+    half, scales = functions.harmonics, model.wave_scales
+    values = functions.waves(poses)
+    values *= scales
+    # The derivative of cos n x is −n sin n x, that of sin n x is n cos n x; both have the same scale.
+    orders, rates = np.arange(1, half + 1), np.empty(values.shape)
+    np.multiply(values[..., half:], -orders, out=rates[..., :half])
+    np.multiply(values[..., :half], orders, out=rates[..., half:])
+    if not robot.joint_is_revolute.all():
+        low, high = robot.joint_limits.T
+        rates *= np.where(robot.joint_is_revolute, 1.0, np.pi / (high - low))[:, None]
+    return values, rates
 
 
 def _basis(robot: Robot, model: ErrorModel, felt: FloatArray) -> FloatArray:
@@ -398,7 +586,8 @@ def _basis(robot: Robot, model: ErrorModel, felt: FloatArray) -> FloatArray:
     half = functions.harmonics
     assert isinstance(functions, JointFunctions)
     slow = np.eye(2 * half)[:, [*range(min(SLOW, half)), *range(half, half + min(SLOW, half))]]
-    rest = joint_features(robot, model, felt)[0].transpose(1, 0, 2)
+    scales = np.sqrt(functions.variances(robot, model.values)[: 2 * half])
+    rest = (functions.waves(Poses(robot, felt)) * scales).transpose(1, 0, 2)
     rest = rest - (rest @ slow) @ slow.T
     count = min(len(felt), FELT_WAVES, 2 * half - slow.shape[1])
     right = np.linalg.svd(rest, full_matrices=True)[2][:, :count] if count else np.zeros((joints, 0, 2 * half))
@@ -409,6 +598,12 @@ def _basis(robot: Robot, model: ErrorModel, felt: FloatArray) -> FloatArray:
 def _through(features: FloatArray, maps: FloatArray) -> FloatArray:
     """Each joint's row times its matrix: (N, joints, F), (joints, F, p) → (N, joints, p)."""
     return np.ascontiguousarray((features.transpose(1, 0, 2) @ maps).transpose(1, 0, 2))
+
+
+def _by_joint(features: FloatArray, size: int) -> FloatArray:
+    """(N, joints, F) → (joints, N/size, size, F): each joint's rows of each run."""
+    n, joints, waves = features.shape
+    return features.reshape(n // size, size, joints, waves).transpose(2, 0, 1, 3)
 
 
 def _spread(kernel: FloatArray, rows: int) -> FloatArray:

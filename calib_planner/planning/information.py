@@ -136,8 +136,7 @@ class LinearisedInformation:
         targets = rows // 3
         size = n // len(gradients)
         pull = (self.weighted.reshape(len(gradients), size * rows, p) @ gradients).reshape(n, rows, p)
-        weights = 2.0 * pull.transpose(2, 1, 0)
-        gradient = self.lin.pull_back(weights.reshape(p, targets, 3, n))
+        gradient = self.lin.pull_back(2.0 * pull)
         noise = self.model.noise
         if isinstance(noise, Isotropic):
             return gradient
@@ -168,6 +167,7 @@ class PlanSpace:
         model: Information of one configuration, repeated as wanted.
         single: Information of one measurement.
         prior: (p, p) M_0.
+        stated: (P, P) the part of M_0 that somebody states of the P parameters.
         feasibility: The constraints.
         test_jacobians: (K, 3·targets, p) rows of (M3) at the test poses, base and target columns included.
         test_floor: (K,) part of ρ0² at a test pose that no coefficient holds [m²]; 0 for few test poses.
@@ -183,6 +183,7 @@ class PlanSpace:
     model: Model
     single: Model
     prior: FloatArray
+    stated: FloatArray
     feasibility: Feasibility
     test_jacobians: FloatArray
     test_floor: FloatArray
@@ -221,24 +222,37 @@ class PlanSpace:
 
 SPREAD = 4.0
 """Factor by which the robot's errors may differ from typical ones: one standard deviation of their scales."""
-UNCERTAIN = ("gravity", "smooth.size", "short.size", "repeatability")
-"""Scales that a plan does not trust until an estimate has taught them."""
 
 
-def spread_spaces(problem: PlanProblem) -> tuple[PlanSpace, ...]:
+def spread_spaces(space: PlanSpace) -> tuple[PlanSpace, ...]:
     """The problem for a robot that errs less, and for one that errs more, than the typical one.
 
     A sum of concave criteria is concave: the search for a plan that is good in the mean of them is as before.
     Nothing for other models: their scales are taught or stated.
     """
-    model = problem.whole_model
+    model = space.problem.whole_model
     if model is None or model.name != "typical":
         return ()
-    spaces = []
-    for factor in (1.0 / SPREAD, SPREAD):
-        values = {name: value * factor for name, value in model.values.items() if name in UNCERTAIN}
-        spaces.append(plan_space(replace(problem, error_model=model.with_values(values, name="spread"))))
-    return tuple(spaces)
+    return tuple(_scaled(space, factor) for factor in (1.0 / SPREAD, SPREAD))
+
+
+def _scaled(space: PlanSpace, factor: float) -> PlanSpace:
+    """The same for a robot whose joints err ``factor`` times as much; see ``ExtendedModel.scaled``."""
+    assert isinstance(space.model, ExtendedModel) and isinstance(space.single, ExtendedModel)
+    single, scales = space.single.scaled(factor), space.single.column_scales(factor)
+    prior = (
+        space.prior if space.problem.measured is None else _with_other_terms(space.problem, single, space.stated)
+    )
+    return replace(
+        space,
+        model=space.model.scaled(factor),
+        single=single,
+        prior=prior,
+        test_jacobians=space.test_jacobians * scales,
+        test_floor=space.test_floor * factor**2,
+        general=space.general * scales[:, None] * scales,
+        general_floor=space.general_floor * factor**2,
+    )
 
 
 def plan_space(problem: PlanProblem) -> PlanSpace:
@@ -270,9 +284,8 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         range(len(free))
     )
     model, single = (_model(problem, robot, r) for r in (problem.repetitions, 1))
-    known = prior[np.ix_(free, free)]
+    known, stated = prior[np.ix_(free, free)], (stated_rows.T @ stated_rows)[np.ix_(free, free)]
     if isinstance(single, ExtendedModel):
-        stated = (stated_rows.T @ stated_rows)[np.ix_(free, free)]
         known = _with_other_terms(problem, single, stated)
     poses, frame = problem.test_pose_array, problem.accuracy_frame
     tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(known)))
@@ -297,6 +310,7 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         model=model,
         single=single,
         prior=known,
+        stated=stated,
         feasibility=feasibility,
         test_jacobians=tests,
         test_floor=floor,

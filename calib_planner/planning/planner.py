@@ -202,7 +202,7 @@ def _search(
 
     search = replace(
         searched(space, criterion),
-        beside=tuple(searched(other, _criterion_of(other, criterion)) for other in spread_spaces(space.problem)),
+        beside=tuple(searched(other, _criterion_of(other, criterion)) for other in spread_spaces(space)),
     )
     sizes = parts(space.problem.starts)
     work = [(search, n, np.random.default_rng(seed)) for n, seed in zip(sizes, seeds, strict=True) if n]
@@ -253,7 +253,7 @@ def _choose(
     allowed = np.flatnonzero(space.feasibility.mask(candidates))
     request = _choice(space, criterion, candidates[allowed], design)
     if request.together is not None:
-        others = spread_spaces(problem)
+        others = spread_spaces(space)
         beside = (_choice(s, _criterion_of(s, criterion), candidates[allowed], design) for s in others)
         request = replace(request, beside=tuple(beside))
     chosen = choose(request, rng, clock.over)

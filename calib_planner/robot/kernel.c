@@ -1,4 +1,4 @@
-/* The programs of kinematics.py, run without an array call per operation.
+/* The programs of kinematics.py, and the running sums of linearisation.py, without an array call per operation.
  *
  * A program is a list of additions, subtractions and products of vectors over configurations. NumPy runs each over a
  * block of configurations with a call of its own; here one call runs them all, over blocks that stay in the
@@ -8,6 +8,9 @@
  *
  * run(code, amounts, q, out): code is Program.code (int32, the layout stands in unpack), amounts (elements,) the
  * amounts of the elements, q (joints, N) and out (rows, N) contiguous, all float64. Nothing is returned.
+ *
+ * pull_back(chain, columns, axes, joint_columns, joint_axes, weights, out): Linearisation.pull_back with the arrays
+ * of that class; chain is Layout.code (int32), weights (N, 3 targets, P or more) and out (N, joints).
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -206,7 +209,121 @@ done:
     return result;
 }
 
+/* ── running sums ──────────────────────────────────────────────────────────────────────────────────── */
+
+#define RUN 32 /* configurations side by side */
+
+typedef struct {
+    Py_ssize_t count, parameters, targets, joints, stride;
+    const int32_t *order, *rotates, *before, *turns; /* parameters in chain order; see Layout.code */
+    const double *columns, *axes, *joint_columns, *joint_axes, *weights;
+} chain;
+
+static inline void cross_add(double *restrict to, const double *restrict u, Py_ssize_t du, const double *restrict v,
+                      Py_ssize_t dv, int n) {
+    const double *ux = u, *uy = u + du, *uz = u + 2 * du, *vx = v, *vy = v + dv, *vz = v + 2 * dv;
+    double *restrict x = to, *restrict y = to + RUN, *restrict z = to + 2 * RUN;
+    NO_OVERLAP
+    for (int i = 0; i < n; i++) {
+        x[i] += uy[i] * vz[i] - uz[i] * vy[i];
+        y[i] += uz[i] * vx[i] - ux[i] * vz[i];
+        z[i] += ux[i] * vy[i] - uy[i] * vx[i];
+    }
+}
+
+static inline void dot_add(double *restrict to, const double *restrict u, Py_ssize_t du, const double *restrict v, int n) {
+    NO_OVERLAP
+    for (int i = 0; i < n; i++) to[i] += u[i] * v[i] + u[i + du] * v[i + RUN] + u[i + 2 * du] * v[i + 2 * RUN];
+}
+
+/* Weights of one parameter and target of n configurations, (3, RUN). */
+static inline void gather(const chain *c, Py_ssize_t first, int n, Py_ssize_t target, Py_ssize_t parameter, double *to) {
+    const double *from = c->weights + (first * c->targets + target) * 3 * c->stride + parameter;
+    for (int i = 0; i < n; i++, from += 3 * c->targets * c->stride) {
+        to[i] = from[0];
+        to[i + RUN] = from[c->stride];
+        to[i + 2 * RUN] = from[2 * c->stride];
+    }
+}
+
+VECTORISED static void sum_back(const chain *c, double *restrict sums, double *restrict gradient, double *out) {
+    const Py_ssize_t N = c->count, T = c->targets, P = c->parameters, L = c->joints;
+    double weight[3 * RUN];
+    for (Py_ssize_t first = 0; first < N; first += RUN) {
+        const int n = (int)(N - first < RUN ? N - first : RUN);
+        memset(gradient, 0, L * RUN * sizeof(double));
+        memset(sums, 0, 3 * RUN * sizeof(double)); /* of J_a × G_a, from the tip */
+        for (Py_ssize_t i = P; i >= 0; i--) {
+            for (Py_ssize_t k = 0; k < L; k++)
+                if (c->before[k] == i && c->turns[k])
+                    dot_add(gradient + k * RUN, c->joint_axes + 3 * k * N + first, N, sums, n);
+            for (Py_ssize_t t = 0; i && t < T; t++) {
+                gather(c, first, n, t, c->order[i - 1], weight);
+                cross_add(sums, c->columns + (c->order[i - 1] * T + t) * 3 * N + first, N, weight, RUN, n);
+            }
+        }
+        memset(sums, 0, 3 * T * RUN * sizeof(double)); /* of G_a × w_a per target, from the base */
+        for (Py_ssize_t i = 0; i <= P; i++) {
+            for (Py_ssize_t k = 0; k < L; k++)
+                for (Py_ssize_t t = 0; c->before[k] == i && t < T; t++)
+                    dot_add(gradient + k * RUN, c->joint_columns + (k * T + t) * 3 * N + first, N, sums + 3 * t * RUN, n);
+            for (Py_ssize_t t = 0; i < P && c->rotates[i] && t < T; t++) {
+                gather(c, first, n, t, c->order[i], weight);
+                cross_add(sums + 3 * t * RUN, weight, RUN, c->axes + 3 * c->order[i] * N + first, N, n);
+            }
+        }
+        for (int i = 0; i < n; i++)
+            for (Py_ssize_t k = 0; k < L; k++) out[(first + i) * L + k] = gradient[k * RUN + i];
+    }
+}
+
+static PyObject *pull_back(PyObject *self, PyObject *const *arguments, Py_ssize_t count) {
+    Py_buffer view[7];
+    const int dimensions[7] = {1, 4, 3, 4, 3, 3, 2};
+    int have = 0, right = 1;
+    PyObject *result = NULL;
+    (void)self;
+    if (count != 7) {
+        PyErr_SetString(PyExc_TypeError, "pull_back(chain, columns, axes, joint_columns, joint_axes, weights, out)");
+        return NULL;
+    }
+    for (; have < 7; have++) {
+        const int flags = have == 6 ? PyBUF_CONTIG : PyBUF_CONTIG_RO;
+        if (PyObject_GetBuffer(arguments[have], &view[have], flags) < 0) goto done;
+        right = right && view[have].ndim == dimensions[have] && view[have].itemsize == (have ? 8 : 4);
+    }
+    if (right) {
+        const Py_ssize_t P = view[1].shape[0], T = view[1].shape[1], N = view[1].shape[3], L = view[3].shape[0];
+        const Py_ssize_t wanted[7][4] = {{2 * P + 2 * L}, {P, T, 3, N}, {P, 3, N}, {L, T, 3, N}, {L, 3, N},
+                                         {N, 3 * T, view[5].shape[2]}, {N, L}};
+        for (int k = 0; k < 7; k++)
+            for (int axis = 0; axis < dimensions[k]; axis++)
+                right = right && view[k].shape[axis] == wanted[k][axis];
+        const int32_t *code = view[0].buf;
+        for (Py_ssize_t a = 0; right && a < P; a++) right = code[a] >= 0 && code[a] < P && code[a] < view[5].shape[2];
+        if (right) {
+            const chain c = {N, P, T, L, view[5].shape[2], code, code + P, code + 2 * P, code + 2 * P + L,
+                             view[1].buf, view[2].buf, view[3].buf, view[4].buf, view[5].buf};
+            double *memory = PyMem_RawMalloc((size_t)(3 * (T + 1) + L) * RUN * sizeof(double));
+            if (!memory) {
+                PyErr_NoMemory();
+                goto done;
+            }
+            Py_BEGIN_ALLOW_THREADS
+            sum_back(&c, memory, memory + 3 * (T + 1) * RUN, view[6].buf);
+            Py_END_ALLOW_THREADS
+            PyMem_RawFree(memory);
+            result = Py_NewRef(Py_None);
+        }
+    }
+    if (!right) PyErr_SetString(PyExc_ValueError, "the shapes do not fit each other, or are not of float64");
+done:
+    while (have--) PyBuffer_Release(&view[have]);
+    return result;
+}
+
 static PyMethodDef methods[] = {
+    {"pull_back", (PyCFunction)(void (*)(void))pull_back, METH_FASTCALL, "see kernel.c"},
     {"run", (PyCFunction)(void (*)(void))run, METH_FASTCALL, "run(code, amounts, q, out): see kernel.c"},
     {NULL, NULL, 0, NULL},
 };

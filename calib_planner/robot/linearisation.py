@@ -20,8 +20,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.robot.kinematics import _kernel
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,14 @@ class Layout:
         front = np.flatnonzero(np.array(self.parameter_rotates, bool)[order])
         before = np.searchsorted(elements[order], np.array(self.joint_elements), side="left")
         return order, front, before, np.array(self.joint_rotates, float)
+
+    @cached_property
+    def code(self) -> NDArray[np.int32]:
+        """The same for ``kernel.c``: P parameters in chain order, whether each of these turns, for each joint the
+        number of parameters in front of it, and whether it turns."""
+        order, _, before, turning = self.running_sums
+        rotates = np.array(self.parameter_rotates, bool)[order]
+        return np.concatenate([order, rotates, before, turning]).astype(np.int32)
 
 
 @dataclass(frozen=True)
@@ -80,11 +90,23 @@ class Linearisation:
         """Gradient in the joints of Σ weights · J.
 
         Args:
-            weights: (P, targets, 3, N), ∂f/∂J.
+            weights: (N, 3·targets, P or more), ∂f/∂J in the order of ``jacobian``; columns beyond the P-th do not
+                matter.
 
         Returns:
             (N, joints), ∂f/∂q.
         """
+        arrays = (self.columns, self.parameter_axes, self.joint_columns, self.joint_axes)
+        if _kernel is not None and weights.flags.c_contiguous and all(a.flags.c_contiguous for a in arrays):
+            out = np.empty((len(weights), len(self.joint_axes)))
+            _kernel.pull_back(self.layout.code, *arrays, weights, out)
+            return out
+        return self.pull_back_numpy(weights)
+
+    def pull_back_numpy(self, weights: FloatArray) -> FloatArray:
+        """``pull_back`` without the compiled kernel."""
+        p, targets, _, n = self.columns.shape
+        weights = np.ascontiguousarray(weights[:, :, :p].transpose(2, 1, 0)).reshape(p, targets, 3, n)
         lay = self.layout
         order, front, before, turning = lay.running_sums
         # Running sums from the tip: Σ J_a × G_a over the parameters at or behind each place of the chain.

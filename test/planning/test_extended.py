@@ -26,13 +26,14 @@ from calib_planner.measurements import Measurements
 from calib_planner.planning import (
     Candidates,
     Search,
+    extended,
     plan_for_accuracy,
     plan_space,
     smallest_size,
     with_wide_placement,
 )
 from calib_planner.planning.bound import approximate_design
-from calib_planner.planning.extended import ExtendedModel
+from calib_planner.planning.extended import UNCERTAIN, ExtendedModel
 from calib_planner.planning.information import spread_spaces
 from calib_planner.planning.planner import _design_problem, value_of
 from calib_planner.planning.search.exchange import ChoiceProblem, _information, choose
@@ -87,6 +88,54 @@ def test_the_gradient_is_that_of_the_information(case: tuple[Robot, ErrorModel])
             rise = asked.totals(q + moved, size) - asked.totals(q - moved, size)
             expected[place] = np.sum(rise * each) / (2 * step)
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_errors_of_another_size_need_no_columns_of_their_own(case: tuple[Robot, ErrorModel]) -> None:
+    """``scaled`` is the model with the scales multiplied; its sums and gradients come from those of the first."""
+    model, q = of(*case)
+    info, rng = model.linearised(q), np.random.default_rng(0)
+    values = {n: 4 * v for n, v in case[1].values.items() if n in UNCERTAIN}
+    apart = ExtendedModel.of(
+        case[0], case[1].with_values(values), random_configurations(case[0], 2, 3) / 3, 2, 1e-5
+    )
+    large = replace(apart, basis=model.basis, maps=model.maps)  # the same U_l, whatever the sign of its columns
+    np.testing.assert_allclose(abs(apart.basis), abs(model.basis), atol=1e-9)
+    got, want = info.sums(4, 4.0), large.totals(q, 4)
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-12 * np.abs(want).max())
+    np.testing.assert_allclose(model.scaled(4.0).totals(q, 4), want, rtol=0, atol=1e-12 * np.abs(want).max())
+    weights = np.repeat(random_weights(rng, model.size), 2, axis=0)
+    both = info.gradient_of_sum([(1.0, weights), (4.0, 3 * weights)])
+    expected = info.gradient(weights) + 3 * large.linearised(q).gradient(weights)
+    np.testing.assert_allclose(both, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+def random_weights(rng: np.random.Generator, size: int) -> np.ndarray:
+    """(1, size, size) positive semi-definite."""
+    draw = rng.standard_normal((1, size, size))
+    return draw @ np.swapaxes(draw, 1, 2)
+
+
+@pytest.mark.skipif(extended._kernel is None, reason="the kernel is not built here")
+@pytest.mark.parametrize("shape", [(1, 1, 3, 6), (5, 1, 6, 2), (1, 7, 3, 6), (3, 4, 9, 7)], ids=str)
+def test_the_compiled_coupling_is_numpys(shape: tuple[int, int, int, int]) -> None:
+    runs, size, rows, joints = shape
+    rng = np.random.default_rng(0)
+    levers, half = rng.standard_normal((runs * size, rows, joints)), rng.standard_normal((joints, runs, size, 5))
+    kernels, changes = half @ np.swapaxes(half, 2, 3), rng.standard_normal((joints, runs, size, size))
+    whole = extended.couple(levers, kernels)
+    expected = extended.couple_numpy(levers, kernels)
+    np.testing.assert_allclose(whole, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    got = [np.ones(levers.shape), np.ones(levers.shape[::2])]
+    want = [array.copy() for array in got]
+    extended.couple_back(levers, kernels, changes, whole, *got)
+    extended.couple_back_numpy(levers, kernels, changes, whole, *want)
+    for one, other in zip(got, want, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
+    for wrong in ((levers[:, :1], kernels, whole), (levers, kernels, whole[:, :1].copy()), (levers, kernels)):
+        with pytest.raises((ValueError, BufferError)):
+            extended._kernel.couple(*wrong)
+    with pytest.raises(ValueError, match="fit"):
+        extended._kernel.couple_back(levers, kernels, changes, whole, *got[::-1])
 
 
 def test_what_is_eliminated_is_the_schur_complement(case: tuple[Robot, ErrorModel]) -> None:
@@ -239,8 +288,8 @@ def test_a_plan_for_a_typical_robot_does_not_trust_one_size_of_its_errors() -> N
     for name in ("typical", "taught"):
         problem = PlanProblem(kuka(), POSE, 6, error_model=replace(given, name=name), search=FEW)
         space, q = plan_space(problem), plan(problem).configurations
-        spaces = (space, *spread_spaces(replace(problem, error_model=given)))
-        assert len(spaces) == 3 and len(spread_spaces(problem)) == (2 if name == "typical" else 0)
+        spaces = (space, *spread_spaces(plan_space(replace(problem, error_model=given))))
+        assert len(spaces) == 3 and len(spread_spaces(space)) == (2 if name == "typical" else 0)
         matrices = [s.model.totals(q, len(q))[0] + s.prior for s in spaces]
         worth[name] = np.mean(
             [np.log(s.search_criterion().exact(m)) for s, m in zip(spaces, matrices, strict=True)]

@@ -98,10 +98,10 @@ def test_second_derivatives_complex_step(robot, deviations):
 def test_pull_back_is_the_contraction_of_the_second_derivatives(robot, deviations):
     q = random_configurations(robot, 6)
     lin = robot.linearise(q, deviations)
-    weights = np.random.default_rng(1).normal(size=lin.columns.shape)
-    flat = weights.reshape(len(weights), -1, len(q))
-    expected = np.einsum("pxn,nxpk->nk", flat, joint_derivatives(lin))
+    weights = np.random.default_rng(1).normal(size=lin.jacobian().shape)
+    expected = np.einsum("nxp,nxpk->nk", weights, joint_derivatives(lin))
     np.testing.assert_allclose(lin.pull_back(weights), expected, atol=1e-12)
+    np.testing.assert_allclose(lin.pull_back_numpy(weights), expected, atol=1e-12)
 
 
 def test_blocks_do_not_show(robot):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import random_configurations
+from robots import mixed, random_configurations
 
 from calib_planner import Robot
 from calib_planner.robot import kinematics
@@ -85,3 +85,24 @@ def test_complex_numbers_are_numpys() -> None:
     program, amounts = robot._program(robot._nominal_amounts, (), ()), robot._nominal_amounts
     q = np.full((6, 1), 0.3 + 1e-30j)
     assert np.iscomplexobj(program.run(q, amounts))
+
+
+@pytest.mark.parametrize("count", [0, 1, 31, 32, 33, 200])
+@pytest.mark.parametrize("name", ["planar_2r", "kuka_kr270", "ur10e", "mixed"])
+def test_pull_back_equal_to_numpy(name: str, count: int) -> None:
+    robot = mixed() if name == "mixed" else Robot.load(name).with_targets([[0.1, 0.0, 0.2], [0.0, 0.1, 0.1]])
+    lin = robot.with_parameters("full", ("base", "tool")).linearise(
+        random_configurations(robot, count + 1)[:count]
+    )
+    rows, parameters = 3 * len(robot.targets), len(lin.columns)
+    weights = np.random.default_rng(0).standard_normal((count, rows, parameters + 2))
+    expected = lin.pull_back_numpy(weights)
+    got = lin.pull_back(weights)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max(initial=0.0)))
+    if count < 2:
+        return
+    arrays = (lin.columns, lin.parameter_axes, lin.joint_columns, lin.joint_axes, weights, np.empty(got.shape))
+    for place in range(6):
+        bad = [a[:-1].copy() if k == place else a for k, a in enumerate(arrays)]
+        with pytest.raises(ValueError, match="fit"):
+            kinematics._kernel.pull_back(lin.layout.code, *bad)

@@ -60,8 +60,8 @@ class SearchProblem:
         feasibility: What they have to obey besides the joint limits.
         support: (K, joints) configurations of the approximate design; K may be 0.
         weights: (K,) their weights.
-        beside: The same problem for other sizes of the robot's errors: the best plan of every part is improved
-            for the mean of log Ψ over all of them.
+        beside: The same problem for other sizes of the robot's errors, its model ``scaled``: the best plan of
+            every part is improved for the mean of log Ψ over all of them.
     """
 
     model: Model
@@ -101,13 +101,21 @@ def plan_objective(problem: SearchProblem, size: int) -> Objective:
 
 
 def mean_objective(problem: SearchProblem, size: int) -> Objective:
-    """The mean of ``plan_objective`` over the problem and those beside it."""
-    every = [plan_objective(p, size) for p in (problem, *problem.beside)]
+    """The mean of ``plan_objective`` over the problem and those beside it, of one model ``scaled``."""
+    every = (problem, *problem.beside)
 
     def objective(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = [part(rows) for part in every]
-        values, gradients = zip(*parts, strict=True)
-        return np.mean(values, axis=0), np.mean(gradients, axis=0)
+        assert isinstance(problem.model, ExtendedModel)
+        info = problem.model.linearised(rows.reshape(len(rows) * size, -1))
+        value, parts = np.zeros(len(rows)), []
+        for part in every:
+            assert isinstance(part.model, ExtendedModel)
+            factor = part.model.factor / problem.model.factor
+            psi, by_matrix = part.criterion.value_and_gradient(ridged(info.sums(size, factor) + part.prior))
+            safe = np.where(psi > 0, psi, 1.0)
+            value += np.where(psi > 0, -np.log(safe), np.inf) / len(every)
+            parts.append((factor, by_matrix / (-len(every) * safe)[:, None, None]))
+        return value, info.gradient_of_sum(parts).reshape(len(rows), -1)
 
     return objective
 
