@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from calib_planner.arrays import FloatArray, plain
 from calib_planner.error_model import Knowledge
 from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.io import (
-    make_folder,
+    fresh_folder,
     read_error_model,
     write_estimate,
     write_measurements,
@@ -41,6 +42,8 @@ from calib_planner.units import MILLI_UNIT, milli, signed
 
 RANDOM_PLANS = 12
 """Random plans that stand for chance: one alone may be lucky. Each takes half a second."""
+PAGE = "calibration.html"
+"""The report, in the folder of a demonstration."""
 ROBOT = "kuka_kr270"
 ERROR_MODEL = "typical"
 """How the robot of the demonstrations errs besides its parameters, see ``read_error_model``."""
@@ -124,12 +127,12 @@ def run_demo(
     folder: str | Path,
     callback: Callback | None = None,
 ) -> DemoResult:
-    """Run the demonstration and leave its files in ``folder``, which is made if need be.
+    """Run the demonstration and leave its files in a new folder: ``folder``, or ``folder-2``, … beside earlier ones.
 
     Raises:
         InputError: The folder cannot be made or written.
     """
-    folder, robot, size = make_folder(folder), Robot.load(ROBOT), (settings.configurations, settings.repetitions)
+    folder, robot, size = fresh_folder(folder), Robot.load(ROBOT), (settings.configurations, settings.repetitions)
     search = Search(starts=settings.starts, seed=settings.seed)
     model = read_error_model(ERROR_MODEL, Isotropic(settings.sigma))
     problem = PlanProblem(robot, [TEST_POSE], *size, error_model=model, search=search)
@@ -154,7 +157,7 @@ def run_demo(
     write_estimate(folder / "estimate.yaml", estimate)
     files: list[tuple[str, str | Path]] = [("robot", ROBOT), ("data", folder / "measurements.csv")]
     made = provenance(files, seed=settings.seed, estimate=str(folder / "estimate.yaml"))
-    write_report(folder / "calibration.html", measured, estimate, made)
+    write_report(folder / PAGE, measured, estimate, made)
     write_text(folder / "demo.json", json.dumps(result.to_dict(), indent=2, ensure_ascii=False) + "\n")
     draw(result, folder / "demo.png")
     return result
@@ -271,7 +274,7 @@ def _shown_errors(result: DemoResult) -> list[tuple[str, str, str, float, float 
 
 def print_table(result: DemoResult, console: Console) -> None:
     """Two tables: parameter by parameter, and the error at the test pose."""
-    table = Table(title=f"{result.robot}: deviations from nominal")
+    table = Table(title=Text(f"{result.robot}: deviations from nominal"))
     table.add_column("parameter")
     table.add_column("unit")
     for heading in ("true", "identified", "± std", "off by"):
@@ -281,10 +284,10 @@ def print_table(result: DemoResult, console: Console) -> None:
         numbers = [signed(1e3 * x, 4, plus=True) for x in (p.true - p.nominal, p.value - p.nominal)]
         table.add_row(p.name, MILLI_UNIT[p.unit], *numbers, milli(p.std), f"{off:.1f} std")
     console.print(table)
-    errors = Table(title="position error at the test pose [mm]")
+    errors = Table(title=Text("position error at the test pose [mm]"))  # as Text: brackets are no markup
     errors.add_column("")
-    errors.add_column("achieved", justify="right")
-    errors.add_column("predicted", justify="right")
+    errors.add_column(Text("achieved [mm]"), justify="right")
+    errors.add_column(Text("predicted [mm]"), justify="right")
     for name, _, _, achieved, predicted in _shown_errors(result):
         errors.add_row(name, f"{achieved:.4f}", "" if predicted is None else f"{predicted:.4f}")
     console.print(errors)
@@ -293,6 +296,16 @@ def print_table(result: DemoResult, console: Console) -> None:
         "under gravity, by its joints and a little anew at each visit: that is what remains. "
         "The random plans were measured in simulation by the library: same true robot, same noise."
     )
+
+
+def print_files(folder: str | Path, console: Console) -> None:
+    """Say where the files are; the last line is the path of the report, or of the picture where there is none."""
+    place = Path(folder).resolve()
+    console.print(f"Files: {', '.join(sorted(p.name for p in place.iterdir() if p.is_file()))}", markup=False)
+    pages = sorted(place.glob("*.html"))
+    last = pages[-1] if pages else place / "demo.png"
+    console.print(f"The {'report' if pages else 'picture'}, to be opened in a browser:", markup=False)
+    console.print(str(last), markup=False, highlight=False, soft_wrap=True)
 
 
 def draw(result: DemoResult, path: str | Path) -> Path:
@@ -311,11 +324,11 @@ def draw(result: DemoResult, path: str | Path) -> Path:
     true, value, std = 1e3 * np.array(rows).T
     deviations.bar(x, true, color="0.8", label="true")
     deviations.errorbar(x, value, 2 * std, fmt="o", ms=4, color="C0", label="identified")
-    deviations.set_title("deviation from nominal [mm | mrad]")
+    deviations.set_title("deviation from nominal\n[mm | mrad]")
     deviations.legend(frameon=False)
     remainder.axhline(0, color="0.5", lw=1)
-    remainder.errorbar(x, 1e3 * (value - true), 2e3 * std, fmt="o", ms=4, capsize=3, color="C0")
-    remainder.set_title("identified − true, ± 2 std [µm | µrad]")
+    remainder.errorbar(x, value - true, 2 * std, fmt="o", ms=4, capsize=3, color="C0")
+    remainder.set_title("identified − true, ± 2 std\n[mm | mrad]")
     for axes in (deviations, remainder):
         axes.set_xticks(x, names)
         axes.spines[["top", "right"]].set_visible(False)
@@ -324,17 +337,19 @@ def draw(result: DemoResult, path: str | Path) -> Path:
 
 
 def _draw_accuracy(axes: Any, result: DemoResult) -> None:
+    """Dots, because a bar on a logarithmic axis begins nowhere."""
     rows = _shown_errors(result)
     for i, (_, _, colour, achieved, predicted) in enumerate(rows):
-        axes.barh(i, achieved, color=colour, height=0.6)
-        axes.text(max(achieved, predicted or 0.0), i, f"  {achieved:.4f}", va="center")
+        axes.plot(achieved, i, "o", ms=9, color=colour, label="achieved" if i == 1 else None)
+        axes.annotate(f"{achieved:.4f}", (achieved, i), (0, 9), textcoords="offset points", ha="center")
         if predicted is not None:
-            label = "predicted" if i == 1 else None
-            axes.plot([predicted] * 2, [i - 0.38, i + 0.38], "k--", label=label)
+            axes.plot(predicted, i, "k|", ms=17, mew=2, label="predicted" if i == 1 else None)
     axes.set_yticks(range(len(rows)), [name for _, name, *_ in rows])
+    axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xscale("log")
-    axes.margins(x=0.25)
-    axes.invert_yaxis()
-    axes.set_title("position error at the test pose [mm]")
-    axes.legend(frameon=False)
+    axes.margins(x=0.15)
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    axes.set_title("position error at the test pose\n[mm], logarithmic")
+    axes.legend(frameon=False, loc="lower right")
     axes.spines[["top", "right"]].set_visible(False)

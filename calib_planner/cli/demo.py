@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 
+from rich.console import Console
+
 from calib_planner.cli.arguments import Commands, add_command, add_seed, option
 from calib_planner.cli.terminal import Terminal
-from calib_planner.demo import DemoSettings, print_table, run_demo
+from calib_planner.demo import DemoResult, DemoSettings, print_files, print_table, run_demo
 from calib_planner.planning import Progress
 from calib_planner.units import length
 
@@ -21,7 +23,9 @@ def add(commands: Commands, summary: str) -> None:
     option(parser, "--repetitions", "K", "number of measurements at each configuration", usual.repetitions)
     option(parser, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", usual.sigma)
     add_seed(parser)
-    option(parser, "--output", "DIR", "folder for the files", "results/demo")
+    option(
+        parser, "--output", "DIR", "folder for the files; DIR-2, DIR-3 … beside earlier results", "results/demo"
+    )
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
@@ -33,5 +37,10 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             update(progress.starts_done / progress.starts_total, text)
 
         result = run_demo(settings, args.output, report)
-    terminal.answer(result.to_dict(), lambda console: print_table(result, console))
-    terminal.note(f"Plan, measurements, estimate, picture and report (calibration.html) are in {args.output}")
+    terminal.answer(result.to_dict(), lambda console: show(result, console))
+
+
+def show(result: DemoResult, console: Console) -> None:
+    """Print what was achieved; the last line is the report's path."""
+    print_table(result, console)
+    print_files(result.report, console)

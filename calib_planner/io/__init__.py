@@ -74,7 +74,7 @@ if TYPE_CHECKING:
         open_store,
         stored_model,
     )
-    from calib_planner.io.text import make_folder, read_text, user_path, write_text
+    from calib_planner.io.text import fresh_folder, make_folder, read_text, user_path, write_text
     from calib_planner.io.urdf import (
         calibrated_urdf,
         parse_speed_limits,
@@ -104,7 +104,7 @@ else:
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
             "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "
             "open_campaign open_store stored_model",
-            "text": "make_folder read_text user_path write_text",
+            "text": "fresh_folder make_folder read_text user_path write_text",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
             "write_calibrated_urdf",
         },

@@ -32,6 +32,23 @@ def make_folder(folder: str | Path, field: str = "output") -> Path:
     return target
 
 
+def fresh_folder(folder: str | Path, field: str = "output") -> Path:
+    """A folder of its own for new results: ``folder`` if it is not there or empty, else ``folder-2``, ``-3``, ….
+
+    Raises:
+        InputError: It cannot be made; names ``field``.
+    """
+    target = user_path(folder)
+    number = 1
+    while (place := target if number == 1 else target.with_name(f"{target.name}-{number}")).exists():
+        if place.is_dir() and not any(place.iterdir()):
+            break
+        if not place.is_dir() and number == 1:
+            break  # a file of that name: make_folder says so
+        number += 1
+    return make_folder(place, field)
+
+
 def read_text(path: str | Path, what: str) -> str:
     """The text of a UTF-8 file, without a byte order mark.
 

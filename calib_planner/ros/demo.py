@@ -41,10 +41,11 @@ from calib_planner.demo import (
     demo_cell,
     demo_report,
     draw,
+    print_files,
     print_table,
 )
 from calib_planner.errors import CalibPlannerError, InfeasibleError
-from calib_planner.io import read_estimate
+from calib_planner.io import fresh_folder, read_estimate
 from calib_planner.planning import PlanProblem
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import plan_from_message
@@ -326,7 +327,7 @@ def main(args: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the nodes, as Ctrl-C does
     screen = Screen()
     try:
-        result = run_demo(chosen.configurations, chosen.seed, chosen.output, screen)
+        result = run_demo(chosen.configurations, chosen.seed, fresh_folder(chosen.output), screen)
     except (CalibPlannerError, OSError) as error:
         screen.close()
         print(f"demo: {error}", file=sys.stderr)
@@ -341,9 +342,7 @@ def main(args: Sequence[str] | None = None) -> int:
     else:
         console = Console()
         print_table(result, console)
-        console.print(f"files in {result.report}:", highlight=False)
-        for path in sorted(p for p in chosen.output.iterdir() if p.is_file()):
-            console.print(f"  {path}", highlight=False)
+        print_files(result.report, console)
     return 0
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from calib_planner import InputError
-from calib_planner.io import write_text
+from calib_planner.io import fresh_folder, write_text
 
 
 def test_replaces_and_keeps_permissions(tmp_path: Path) -> None:
@@ -53,3 +53,15 @@ def test_unwritable_paths_name_the_option(tmp_path: Path, name: str) -> None:
 def test_devices_are_written_to(tmp_path: Path) -> None:
     write_text(os.devnull, "x")
     assert not Path(os.devnull).is_file()
+
+
+def test_a_fresh_folder_never_holds_earlier_results(tmp_path: Path) -> None:
+    first = fresh_folder(tmp_path / "new" / "demo")
+    assert first == tmp_path / "new" / "demo" and fresh_folder(first) == first  # still empty
+    (first / "a").write_text("")
+    second = fresh_folder(first)
+    (second / "b").write_text("")
+    assert second.name == "demo-2" and fresh_folder(first).name == "demo-3"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="out"):
+        fresh_folder(tmp_path / "file", "out")

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from calib_planner import IdentificationProblem, PlanProblem, Robot, identify, plan
-from calib_planner.demo import DemoResult, demo_report, draw, print_table
+from calib_planner.demo import DemoResult, demo_report, draw, print_files, print_table
 from calib_planner.error_model import ErrorModel
 from calib_planner.errors import InputError
 from calib_planner.planning import Search
@@ -72,3 +72,16 @@ def test_unidentified_parameters_do_not_break_it(result: DemoResult, tmp_path: P
     print_table(blind, Console(file=io.StringIO()))
     draw(blind, tmp_path / "a.png")
     assert blind.to_dict()["parameters"][0]["std"] is None
+
+
+def test_the_table_keeps_its_units_and_the_last_line_is_the_page(result: DemoResult, tmp_path: Path) -> None:
+    console = Console(file=io.StringIO(), width=100)  # with markup, which takes [mm] for a style
+    print_table(result, console)
+    (tmp_path / "calibration.html").write_text("")
+    print_files(tmp_path, console)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "achieved [mm]" in shown and "predicted [mm]" in shown and "test pose [mm]" in shown
+    assert shown.splitlines()[-1] == str(tmp_path / "calibration.html")
+    (tmp_path / "calibration.html").unlink()
+    print_files(tmp_path, console)
+    assert console.file.getvalue().splitlines()[-1] == str(tmp_path / "demo.png")  # type: ignore[attr-defined]
