@@ -12,7 +12,7 @@ interfaces and rclpy have to be importable, the library from ROOT.
 import importlib
 import re
 import sys
-from importlib.metadata import distributions
+from importlib.metadata import Distribution, distributions
 from pathlib import Path
 
 LINE = re.compile(r"([A-Za-z0-9][\w.-]*)(?:\[.*\])?(?:==([^\s;]+))?")
@@ -24,9 +24,16 @@ def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+def whole(distribution: Distribution) -> bool:
+    """Whether the files and folders that the package put side by side are still there."""
+    record = distribution.read_text("RECORD") or ""
+    tops = {line.split(",")[0].split("/")[0].strip('"') for line in record.splitlines()} - {"..", ""}
+    return all(Path(str(distribution.locate_file(top))).exists() for top in tops if top != "__pycache__")
+
+
 def missing_packages(files: list[str]) -> list[str]:
     """Requirements that are not installed."""
-    present = {normal(d.metadata["Name"]): d.version for d in distributions() if d.metadata["Name"]}
+    present = {normal(d.metadata["Name"]): d.version for d in distributions() if d.metadata["Name"] and whole(d)}
     wanted = [LINE.match(line) for file in files for line in Path(file).read_text().splitlines()]
     return [
         f"{match[1]} {match[2] or ''} is not installed".replace("  ", " ")
