@@ -5,8 +5,8 @@ there: a package may have been taken away since, or a folder emptied.
 
     python tools/check_setup.py ROOT [REQUIREMENTS…]
 
-Every name in the requirements files has to be installed, in the pinned version where there is one. The library, its
-interfaces and rclpy have to be importable, the library from ROOT.
+Every name in the requirements files has to be installed, in the pinned version where there is one. The library,
+its interfaces and rclpy have to be importable, the library from ROOT.
 """
 
 import importlib
@@ -48,7 +48,7 @@ def missing_modules(root: str) -> list[str]:
     for name in MODULES:
         try:
             module = importlib.import_module(name)
-        except Exception as error:  # noqa: BLE001 (whatever it is, the set-up is not ready)
+        except Exception as error:  # whatever it is, the set-up is not ready
             found.append(f"import {name}: {error}")
             continue
         where = Path(module.__file__ or "").resolve()
