@@ -23,7 +23,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray
 from calib_planner.campaign.problem import CampaignProblem, Round
 from calib_planner.campaign.state import FIT, CampaignState
-from calib_planner.error_model import ErrorModel, typical
+from calib_planner.error_model import ErrorModel, gravity_of, typical
 from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.tracker import Isotropic, Noise
@@ -121,7 +121,7 @@ def assess(state: CampaignState) -> Assessment | None:
 def expected(problem: CampaignProblem) -> ErrorModel:
     """How robot and measurement err before anything is measured; the noise is an expectation."""
     model, prior = problem.identification.get("error_model"), problem.identification.get("prior")
-    model = typical() if model is None else model
+    model = typical(gravity=gravity_of(problem.robot)) if model is None else model
     if not model.is_papers and not model.points.estimate_scale:
         factor = next(s for s in typical(estimate_scale=True).scales if s.name == "instrument")
         points = replace(model.points, estimate_scale=True)

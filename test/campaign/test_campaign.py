@@ -21,11 +21,12 @@ from calib_planner.campaign import (
     from_measurements,
     run_campaign,
 )
-from calib_planner.campaign.assess import assess
+from calib_planner.campaign.assess import assess, expected
 from calib_planner.campaign.finish import APART
-from calib_planner.error_model import typical
+from calib_planner.error_model import gravity_of, typical
 from calib_planner.identification import IdentificationProblem
 from calib_planner.planning import Search, plan_for_accuracy
+from calib_planner.robot.masses import LinkMass
 from calib_planner.simulation import simulated
 from calib_planner.units import length
 
@@ -330,3 +331,11 @@ def test_bad_problems_are_refused_by_name(changes, field):
 def test_a_budget_too_small_to_identify_is_refused_before_anything_moves():
     with pytest.raises(InfeasibleError, match="budget"):
         decide(begin(kuka(budget=8)))
+
+
+def test_masses_that_the_robot_states_are_expected_in_a_campaign() -> None:
+    problem = planar(identification={})
+    masses = (LinkMass(0, 7.0, (0.4, 0.0, 0.0)), LinkMass(1, 3.0, (0.3, 0.0, 0.0)))
+    robot = replace(problem.robot, link_masses=masses)
+    gravity = expected(replace(problem, robot=robot)).gravity
+    assert gravity == gravity_of(robot) != expected(problem).gravity
