@@ -1,26 +1,37 @@
 """How good could any plan be? An upper bound on its value Ψ from the best approximate design.
 
-Let an *approximate design* be a probability measure ξ in place of "n measurements, each at one configuration",
-with M(ξ) = M_0 + n Σ w_k I_1(q_k). By (B) of ``criteria``, for any M with gradient G and sensitivity
-d(q) = tr(G I_1(q)),
+Let an *approximate design* be a probability measure ξ in place of "m visits, each to one configuration, with r
+measurements at each", with M(ξ) = M_0 + m Σ w_k I_r(q_k), I_r(q) being what a visit tells (see
+``information``). By (B) of ``criteria``, for any M with gradient G and sensitivity d(q) = tr(G I_r(q)),
 
-    Ψ(M*) ≤ tr(G M*) ≤ tr(G M_0) + n max_q d(q)          for every plan M* of n measurements,              (1)
+    Ψ(M*) ≤ tr(G M*) ≤ tr(G M_0) + m max_q d(q)          for every plan M* of m visits,                   (1)
 
-whatever its configurations and repetitions: n measurements with σ_c count at most as n at different places.
-That is the equivalence theorem; it is tight at the optimal measure. For eq. (14) it reads
-ρ0² ≥ φ²/d_max with φ = tr(A M⁻¹) and d = tr(A M⁻¹ I M⁻¹).
+whatever its configurations. That is the equivalence theorem; it is tight at the optimal measure. For eq. (14)
+it reads ρ0² ≥ φ²/d_max with φ = tr(A M⁻¹) and d = tr(A M⁻¹ I M⁻¹).
+
+The repetitions r are part of the bound, because an error σ_c of the configuration makes r measurements of one
+visit tell less than r visits: I_r(q) ⪯ r I_1(q), with equality for σ_c = 0. A plan in which two of the m
+configurations coincide counts as two visits, each with an error of its own. If σ_c belongs to the place, so that
+both have the same error, they tell less, (Σ/2r + σ_c² I)⁻¹ ⪯ 2 (Σ/r + σ_c² I)⁻¹, and (1) holds all the more.
 
 The measure improves by multiplicative updates w_k ← w_k (d_k / mean)^e in turn with adding maxima of d. The bound
-is as good as the maximisation of d: by search it is "numerical".
+is as good as the maximisation of d: by search it is "numerical". Then ``maximised`` goes on from further random
+configurations until they raise the bound no more than a tolerance. If a plan M* is better than its bound, G
+itself says which part of the work was at fault: Ψ(M*) ≤ tr(G M_0) + Σ d(q_i), so that d is larger at a
+configuration of that plan than the maximum that was taken. ``raised`` maximises d again from there.
 
 Among a finite number of candidates every d_j is computed, so that the bound is exact. If each of m candidates may
-be chosen only once, with r measurements at it, (B) gives
+be chosen only once, (B) gives
 
-    Ψ(M*) ≤ tr(G M_0) + r Σ (the m largest d_j),                                                           (2)
+    Ψ(M*) ≤ tr(G M_0) + Σ (the m largest d_j),                                                            (2)
 
-at most the n·max d_j of (1); the measure that makes it tight has weights capped at 1/m. Most candidates get no
+at most the m·max d_j of (1); the measure that makes it tight has weights capped at 1/m. Most candidates get no
 weight: the updates run over those that have some, and after every round all candidates are looked at again. One
 round costs one product over the candidates.
+
+*Whole numbers.* A measure may divide its m visits among any number of configurations; a plan cannot. For small m
+this alone keeps the best plan below the bound. No bound that knows whole numbers is computed: ``rounded`` says
+what the best whole-number plan at the configurations of the measure reaches.
 """
 
 from __future__ import annotations
@@ -32,13 +43,15 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning.criteria import Criterion
+from calib_planner.planning.criteria import Criterion, is_sharp, sharpened
 from calib_planner.planning.extended import ExtendedModel, LinearisedExtension
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.information import Model
 from calib_planner.planning.search.descent import Descent, climb, descend
 
 SPREAD = 256
+POOL = 400
+"""Random configurations that share the first measure: a good one has some of them near its own."""
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
 """Weight of a spread of random configurations in every measure, first and last. The optimum is often singular:
 the spread makes M invertible and d smooth, and costs the bound about its weight times the price of a random
@@ -50,22 +63,22 @@ class DesignProblem:
     """What the approximate design is to be best for.
 
     Attributes:
-        model: Information of one measurement (repetitions = 1).
+        model: Information of one visit, with its repetitions.
         criterion: A concave criterion.
         prior: (p, p) M_0.
-        measurements: n.
+        visits: m.
         feasibility: Where measuring is possible.
         candidates: (C, joints) the only configurations there are, or ``None`` for all within the limits.
-        distinct: m if every candidate may be chosen once only, else ``None``.
+        distinct: Whether every candidate may be chosen once only.
     """
 
     model: Model
     criterion: Criterion
     prior: FloatArray
-    measurements: int
+    visits: int
     feasibility: Feasibility
     candidates: FloatArray | None = None
-    distinct: int | None = None
+    distinct: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +91,9 @@ class ApproximateDesign:
         weights: (K,) weights of the configurations, summing to one.
         gradient: (p, p) G that gave the bound.
         support: (K, joints) its configurations [rad | m]; empty where the caller knows them.
+        seen: The model whose sensitivity gave the bound: the problem's own, or that of (2) of ``extended``.
+        ground: tr(G M_0), with what ``extended`` adds to M_0.
+        missed: Relative rise of the bound below which the maximisation of d ended; 0 where every d is known.
     """
 
     value: float
@@ -85,6 +101,9 @@ class ApproximateDesign:
     weights: FloatArray
     gradient: FloatArray
     support: FloatArray
+    seen: Model | None = None
+    ground: float = 0.0
+    missed: float = 0.0
 
 
 def approximate_design(
@@ -106,43 +125,122 @@ def approximate_design(
         rounds: Most rounds.
         gap: Relative.
     """
-    model, n = problem.model, problem.measurements
-    if isinstance(model, ExtendedModel):
-        return _extended_design(problem, model, start, rng, cancel)
-    if problem.candidates is not None:
-        q = problem.candidates[problem.feasibility.mask(problem.candidates)]
-        if not len(q):
-            raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
-        rows = model.whitened(q)
-        design = candidate_design(rows, problem.criterion, problem.prior, n, problem.distinct, cancel)
-        return replace(design, support=q)
-    everywhere = model.at(problem.feasibility.sample(rng, SPREAD)).mean(axis=0)
-    support: FloatArray = np.concatenate([start, problem.feasibility.sample(rng, 16)])
-    weights: FloatArray = np.full(len(support), 1.0 / len(support))
-    best: ApproximateDesign | None = None
+    if isinstance(problem.model, ExtendedModel):
+        return _extended_design(problem, problem.model, start, rng, cancel)
+    if problem.candidates is None:
+        return _grown(problem, *_first_measure(problem, start, rng), rng, cancel, rounds=rounds, gap=gap)
+    q = problem.candidates[problem.feasibility.mask(problem.candidates)]
+    if not len(q):
+        raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
+    rows = problem.model.whitened(q)
+    distinct = problem.visits if problem.distinct else None
+    design = candidate_design(rows, problem.criterion, problem.prior, problem.visits, distinct, cancel)
+    return replace(design, support=q, seen=problem.model)
+
+
+def continued(
+    problem: DesignProblem,
+    design: ApproximateDesign,
+    more: FloatArray,
+    rng: np.random.Generator,
+    cancel: Callable[[], bool] = lambda: False,
+) -> ApproximateDesign:
+    """The design grown on with the configurations ``more`` (K, joints), where d is larger than it had seen."""
+    strong = design.weights > 1e-6
+    support = np.concatenate([design.support[strong], more])
+    weights = np.concatenate([design.weights[strong], np.full(len(more), 0.02)])
+    everywhere = problem.model.at(problem.feasibility.sample(rng, SPREAD)).mean(axis=0)
+    first = FIRST_FLOOR * FALL**4
+    return _grown(problem, support, weights / weights.sum(), everywhere, rng, cancel, floor=first)
+
+
+def _first_measure(
+    problem: DesignProblem, start: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Configurations (K, joints), weights (K,) and the mean information everywhere (p, p)."""
+    pool = np.concatenate([start, problem.feasibility.sample(rng, POOL)])
+    unit = problem.model.at(pool)
+    everywhere = unit[len(start) :].mean(axis=0)
+    ground = problem.prior + problem.visits * FIRST_FLOOR * everywhere
+    equal: FloatArray = np.full(len(pool), 1.0 / len(pool))
+    weights, _ = _reweighted(problem.criterion, problem.visits * unit, equal, ground, iterations=40, exponent=1.0)
+    heaviest = np.argsort(-weights)[: max(40, len(ground))]
+    heaviest = heaviest[weights[heaviest] > 1e-4]
+    return pool[heaviest], weights[heaviest] / weights[heaviest].sum(), everywhere
+
+
+FALL = 0.5
+"""Factor by which the floor falls from round to round."""
+SHARPEST = 16.0
+"""Factor of the exponent of non-smooth criteria at the lowest floor."""
+
+
+def _grown(
+    problem: DesignProblem,
+    support: FloatArray,
+    weights: FloatArray,
+    everywhere: FloatArray,
+    rng: np.random.Generator,
+    cancel: Callable[[], bool],
+    *,
+    rounds: int = 60,
+    gap: float = 3e-3,
+    floor: float = FIRST_FLOOR,
+) -> ApproximateDesign:
+    model, visits, best = problem.model, problem.visits, None
     for step in range(rounds):
-        floor = max(FIRST_FLOOR * 0.7**step, LAST_FLOOR)
-        ground = problem.prior + n * floor * everywhere
-        unit = n * (1.0 - floor) * model.at(support)
-        # Exponent ½ is monotone for traces; sharper criteria (worst case, smallest eigenvalue) overshoot with it.
+        criterion = sharpened(problem.criterion, min(2.0**step, SHARPEST))
+        ground = problem.prior + visits * floor * everywhere
+        unit = visits * (1.0 - floor) * model.at(support)
         weights, matrix = _reweighted(
-            problem.criterion, unit, weights, ground, iterations=100, exponent=0.5, growth=1.1
+            criterion, unit, weights, ground, iterations=100, exponent=_exponent(criterion), growth=1.1
         )
-        gradient = problem.criterion.supporting_gradient(matrix)
+        gradient = criterion.supporting_gradient(matrix)
+        known = ApproximateDesign(
+            problem.criterion.exact(matrix),
+            np.inf,
+            weights,
+            gradient,
+            support,
+            model,
+            float(np.sum(gradient * problem.prior)),
+        )
         peaks = maximise_sensitivity(problem, gradient, _probes(problem, gradient, support, weights, rng))
-        value = problem.criterion.exact(matrix)
-        ceiling = float(np.sum(gradient * problem.prior)) + n * float(np.exp(-peaks.value.min()))
-        best = _better(best, ApproximateDesign(value, max(ceiling, value), weights, gradient, support))
+        best = _better(best, _with_top(problem, known, float(np.exp(-peaks.value.min()))))
         if best.value >= (1.0 - gap) * best.bound or cancel():
             break
-        new = peaks.x[np.argsort(peaks.value)[:6]]
+        new = _apart(problem, peaks)
         strong = weights > 1e-6
         share = 0.02 if floor > LAST_FLOOR else 0.005
         support = np.concatenate([support[strong], new])
         weights = np.concatenate([weights[strong], np.full(len(new), share / len(new))])
         weights /= weights.sum()
+        floor = max(FALL * floor, LAST_FLOOR)
     assert best is not None
-    return _checked(problem, best, rng) if problem.feasibility.constraints else best
+    return best
+
+
+def _exponent(criterion: Criterion) -> float:
+    """First exponent of the updates: sharp criteria (worst case, smallest eigenvalue) overshoot with more."""
+    return 0.5 if is_sharp(criterion) else 1.0
+
+
+DISTINCT = 5e-3
+"""Distance of two maxima that are taken as one, as a share of the joint ranges."""
+
+
+def _apart(problem: DesignProblem, peaks: Descent) -> FloatArray:
+    """(K, joints) the highest of ``peaks``, at least half the highest, each place once."""
+    low, high = problem.model.robot.joint_limits.T
+    order = np.argsort(peaks.value, kind="stable")
+    x = peaks.x[order[peaks.value[order] <= peaks.value[order[0]] + np.log(2.0)]]
+    distance = np.abs((x[:, None] - x[None]) / (high - low)).max(axis=2)
+    return np.asarray(x[~np.triu(distance < DISTINCT, 1).any(axis=0)])
+
+
+def _with_top(problem: DesignProblem, design: ApproximateDesign, top: float) -> ApproximateDesign:
+    """The bound by (1) if d is nowhere above ``top``."""
+    return replace(design, bound=max(design.ground + problem.visits * top, design.value))
 
 
 def _better(best: ApproximateDesign | None, new: ApproximateDesign) -> ApproximateDesign:
@@ -150,22 +248,76 @@ def _better(best: ApproximateDesign | None, new: ApproximateDesign) -> Approxima
     if best is None:
         return new
     top, low = (new if new.value > best.value else best), (new if new.bound < best.bound else best)
-    return replace(top, bound=max(low.bound, top.value), gradient=low.gradient)
+    bound = max(low.bound, top.value)
+    return replace(top, bound=bound, gradient=low.gradient, seen=low.seen, ground=low.ground)
 
 
-def _checked(problem: DesignProblem, best: ApproximateDesign, rng: np.random.Generator) -> ApproximateDesign:
-    """The bound once more from a thorough maximisation of d: along the edge of what is allowed, descents end too
-    early, and of many bounds the least would be the one that ended first."""
+# ── what a numerical bound may have missed ───────────────────────────────────────────────────────────────
 
-    def height(q: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("nab,ab->n", problem.model.at(q), best.gradient))
+MAY_MISS = 1e-4
+"""Relative rise of the bound, half of it for ρ0, that is not worth another batch of starts: less than what the
+measure leaves open."""
+QUIET, MOST_BATCHES = 2, 8
+"""Batches in succession that raise the bound by less than that before the maximisation ends; most of them."""
+STARTS, DRAWN = 24, 2048
+"""Starts in a batch: the highest of so many random configurations."""
+EXTENDED_STARTS, EXTENDED_DRAWN = 12, 256
+"""The same with a whole error model, whose evaluations take ten times as long."""
 
-    drawn = problem.feasibility.sample(rng, 4096)
-    starts = np.concatenate([best.support, drawn[np.argsort(-height(drawn))[:32]]])
-    inside = maximise_sensitivity(problem, best.gradient, starts).x
-    top = climb(problem.feasibility, height, inside, rng)[1].max()
-    ceiling = float(np.sum(best.gradient * problem.prior)) + problem.measurements * float(top)
-    return replace(best, bound=max(ceiling, best.bound))
+
+def maximised(
+    problem: DesignProblem, design: ApproximateDesign, rng: np.random.Generator, cancel: Callable[[], bool]
+) -> ApproximateDesign:
+    """The bound from a thorough maximisation of d: batches of starts, until some of them raise it no more.
+
+    Of many bounds the least may be the one whose maximisation ended too early. ``missed`` of the result is the
+    tolerance that was reached, or the last rise where ``MOST_BATCHES`` or ``cancel`` ended the work.
+    """
+    if problem.candidates is not None:
+        return design
+    extended = isinstance(design.seen, ExtendedModel)
+    starts, drawn = (EXTENDED_STARTS, EXTENDED_DRAWN) if extended else (STARTS, DRAWN)
+    known, quiet, missed = design.support[np.argsort(-design.weights)[:starts]], 0, np.inf
+    for _ in range(MOST_BATCHES):
+        random = problem.feasibility.sample(rng, drawn)
+        highest = np.argsort(-heights_of(design, random), kind="stable")[:starts]
+        higher = _from(problem, design, np.concatenate([known, random[highest]]), rng)
+        rise = higher.bound / design.bound - 1.0
+        quiet = quiet + 1 if rise <= MAY_MISS else 0
+        missed = max(rise, MAY_MISS)
+        design, known = replace(higher, missed=missed), known[:0]
+        if quiet == QUIET or cancel():
+            break
+    return design
+
+
+def raised(
+    problem: DesignProblem, design: ApproximateDesign, configurations: FloatArray, rng: np.random.Generator
+) -> ApproximateDesign:
+    """The bound once more, d being maximised from ``configurations`` (K, joints) of a plan that has beaten it.
+
+    The result is above that plan, whatever the maximiser does: the heights at its configurations count too.
+    """
+    return _from(problem, design, configurations, rng)
+
+
+def _from(
+    problem: DesignProblem, design: ApproximateDesign, starts: FloatArray, rng: np.random.Generator
+) -> ApproximateDesign:
+    """The bound raised by maxima of d from ``starts`` (K, joints), at least by the heights of these."""
+    assert design.seen is not None
+    peaks = maximise_sensitivity(replace(problem, model=design.seen), design.gradient, starts)
+    top = max(float(heights_of(design, starts).max()), float(np.exp(-peaks.value.min())))
+    if problem.feasibility.constraints:  # along the edge of what is allowed descents end too early
+        best = peaks.x[np.argsort(peaks.value)[:STARTS]]
+        top = max(top, climb(problem.feasibility, lambda q: heights_of(design, q), best, rng)[1].max())
+    return replace(design, bound=max(design.bound, design.ground + problem.visits * top))
+
+
+def heights_of(design: ApproximateDesign, q: FloatArray) -> FloatArray:
+    """d(q) of the bound at ``q`` (N, joints): (N,)."""
+    assert design.seen is not None
+    return _heights(design.seen, design.gradient, q)
 
 
 def _probes(
@@ -272,7 +424,7 @@ def _extended_design(
 ) -> ApproximateDesign:
     """The same as ``approximate_design`` with (2) of ``extended``: heights are those of the model seen from the
     design, and M₀ has Σ_l Θ_lᵀΘ_l beside it."""
-    n, feasibility = problem.measurements, problem.feasibility
+    visits, feasibility = problem.visits, problem.feasibility
     candidates = problem.candidates
     if candidates is not None:
         candidates = candidates[feasibility.mask(candidates)]
@@ -287,22 +439,28 @@ def _extended_design(
     best: ApproximateDesign | None = None
     for step in range(ROUNDS):
         floor = max(FIRST_FLOOR * 0.5**step, LAST_FLOOR)
-        ground = problem.prior + n * floor * everywhere
-        mass = n * (1.0 - floor)
+        ground = problem.prior + visits * floor * everywhere
         weights, matrix, seen, extra = _reweighted_together(
-            problem.criterion, model.linearised(support), weights, mass, ground
+            problem.criterion, model.linearised(support), weights, visits * (1.0 - floor), ground
         )
         gradient = problem.criterion.supporting_gradient(matrix)
+        known = ApproximateDesign(
+            problem.criterion.exact(matrix),
+            np.inf,
+            weights,
+            gradient,
+            support,
+            seen.model,
+            float(np.sum(gradient * (problem.prior + extra))),
+        )
         lifted = replace(problem, model=seen.model)
         if candidates is not None:
             where, heights = candidates, _heights(seen.model, gradient, candidates)
         else:
             peaks = maximise_sensitivity(lifted, gradient, _probes(lifted, gradient, support, weights, rng))
             where, heights = peaks.x, np.exp(-peaks.value)
-        value, distinct = problem.criterion.exact(matrix), problem.distinct
-        top = float(np.mean(np.sort(heights)[-distinct:])) if distinct else float(heights.max())
-        ceiling = float(np.sum(gradient * (problem.prior + extra))) + n * top
-        best = _better(best, ApproximateDesign(value, max(ceiling, value), weights, gradient, support))
+        top = np.mean(np.sort(heights)[-visits:]) if problem.distinct else heights.max()
+        best = _better(best, _with_top(problem, known, float(top)))
         if best.value >= (1.0 - CLOSE_ENOUGH) * best.bound or cancel():
             break
         new = where[np.argsort(-heights, kind="stable")[:6]]
@@ -355,7 +513,7 @@ def candidate_design(
     rows: FloatArray,
     criterion: Criterion,
     prior: FloatArray,
-    measurements: int,
+    visits: int,
     distinct: int | None,
     cancel: Callable[[], bool] = lambda: False,
     *,
@@ -365,10 +523,10 @@ def candidate_design(
     """Improve a measure over candidates until its value is within ``gap`` of the bound, eq. (2).
 
     Args:
-        rows: (C, k, p) W^½ J of one measurement at each candidate.
+        rows: (C, k, p) W^½ J of one visit to each candidate.
         criterion: A concave criterion.
         prior: (p, p) M_0.
-        measurements: Measurements in all.
+        visits: Visits in all.
         distinct: m when every candidate may be used once only, else ``None``.
         cancel: Called after every round; ``True`` ends the work with what there is.
         gap: Relative.
@@ -384,7 +542,7 @@ def candidate_design(
         own = rows[active]
         part, matrix = _reweighted(
             criterion,
-            measurements * (np.swapaxes(own, 1, 2) @ own),
+            visits * (np.swapaxes(own, 1, 2) @ own),
             _capped(weights[active], cap),
             prior,
             iterations=30 if step else 12,
@@ -396,8 +554,10 @@ def candidate_design(
         gradient = criterion.supporting_gradient(matrix)
         height = ((flat @ gradient) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
         top = np.sort(np.partition(height, len(height) - distinct)[-distinct:]) if distinct else height.max()
-        ceiling = float(np.sum(gradient * prior) + measurements * np.mean(top))
-        best = _better(best, ApproximateDesign(criterion.exact(matrix), ceiling, weights, gradient, nowhere))
+        ground = float(np.sum(gradient * prior))
+        ceiling = ground + visits * float(np.mean(top))
+        made = ApproximateDesign(criterion.exact(matrix), ceiling, weights, gradient, nowhere, None, ground)
+        best = _better(best, made)
         if best.value >= (1.0 - gap) * best.bound or cancel():
             break
         promising = np.where(weights > 0, -np.inf, height)

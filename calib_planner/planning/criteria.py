@@ -28,7 +28,7 @@ Pathre 1990; O3, O4: Nahvi et al. 1994, 1996; O5: Sun and Hollerbach 2008.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -64,12 +64,26 @@ class Criterion(Protocol):
         """Ψ itself at one matrix (p, p), unsmoothed."""
         ...
 
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        """The same of matrices (S, p, p): (S,)."""
+        ...
+
 
 def _symmetric(gradient: FloatArray) -> FloatArray:
     return 0.5 * (gradient + np.swapaxes(gradient, -1, -2))
 
 
-class _Smooth:
+class _Exact:
+    """What follows from ``exact_values``."""
+
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def exact(self, matrix: FloatArray) -> float:
+        return float(self.exact_values(matrix[None])[0])
+
+
+class _Smooth(_Exact):
     """Methods that all differentiable criteria share."""
 
     concave = True
@@ -80,8 +94,8 @@ class _Smooth:
     def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         return self.value_and_gradient(matrix[None])[1][0]
 
-    def exact(self, matrix: FloatArray) -> float:
-        return float(self.value_and_gradient(matrix[None])[0][0])
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        return self.value_and_gradient(matrices)[0]
 
 
 @dataclass(frozen=True)
@@ -102,7 +116,7 @@ class Accuracy(_Smooth):
 
 
 @dataclass(frozen=True)
-class WorstAccuracy:
+class WorstAccuracy(_Exact):
     """1 / max_k trace(A_k M⁻¹): the worst of several test poses.
 
     The search uses the power mean Σ_k (…)^s with s = ``sharpness`` for the maximum. For (B) any mixture
@@ -136,8 +150,8 @@ class WorstAccuracy:
         mixed = np.einsum("k,kab->ab", powers / powers.sum(), self.weights)
         return Accuracy(mixed).supporting_gradient(matrix)
 
-    def exact(self, matrix: FloatArray) -> float:
-        return float(1.0 / self._values(matrix[None])[1].max())
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        return np.asarray(1.0 / self._values(matrices)[1].max(axis=1))
 
 
 @dataclass(frozen=True)
@@ -188,14 +202,14 @@ class PowerMean(_Smooth):
         weights = (values[0] / np.maximum(values, 1e-300)) ** (self.power + 1.0)
         return (vectors * (weights / weights.sum())) @ vectors.T
 
-    def exact(self, matrix: FloatArray) -> float:
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
         if self.smallest:
-            return float(max(np.linalg.eigvalsh(matrix)[0], 0.0))
-        return super().exact(matrix)
+            return np.maximum(np.linalg.eigvalsh(matrices)[:, 0], 0.0)
+        return super().exact_values(matrices)
 
 
 @dataclass(frozen=True)
-class EigenvalueRatio:
+class EigenvalueRatio(_Exact):
     """λ_min^a / λ_max: O2 (a = 1) and O4 (a = 2); not concave, searched through power means."""
 
     numerator: float
@@ -218,9 +232,9 @@ class EigenvalueRatio:
     def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         raise NotImplementedError("this criterion is not concave: it has no bound")
 
-    def exact(self, matrix: FloatArray) -> float:
-        values = np.linalg.eigvalsh(matrix)
-        return float(max(values[0], 0.0) ** self.numerator / values[-1])
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        values = np.linalg.eigvalsh(matrices)
+        return np.asarray(np.maximum(values[:, 0], 0.0) ** self.numerator / values[:, -1])
 
 
 @dataclass(frozen=True)
@@ -251,7 +265,7 @@ class Compound(_Smooth):
 
 
 @dataclass(frozen=True)
-class Eliminating:
+class Eliminating(_Exact):
     """A criterion of the parameters of interest, the nuisance ones eliminated.
 
     What M says about the first block once the second is estimated with it is the Schur complement
@@ -293,8 +307,31 @@ class Eliminating:
         schur, lift = self._reduce(matrix[None])
         return lift[0] @ self.inner.supporting_gradient(schur[0]) @ lift[0].T
 
-    def exact(self, matrix: FloatArray) -> float:
-        return self.inner.exact(self._reduce(matrix[None])[0][0])
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        return self.inner.exact_values(self._reduce(matrices)[0])
+
+
+def sharpened(criterion: Criterion, factor: float) -> Criterion:
+    """The same criterion, its smooth form closer to the exact one by a larger exponent. Smooth ones stay, and
+    so do compound ones, which are defined by the smooth form of their parts."""
+    if isinstance(criterion, PowerMean) and criterion.smallest:
+        return replace(criterion, power=factor * criterion.power)
+    if isinstance(criterion, WorstAccuracy) and len(criterion.weights) > 1:
+        return replace(criterion, sharpness=factor * criterion.sharpness)
+    if isinstance(criterion, EigenvalueRatio):
+        return replace(criterion, power=factor * criterion.power)
+    if isinstance(criterion, Eliminating):
+        return replace(criterion, inner=sharpened(criterion.inner, factor))
+    return criterion
+
+
+def is_sharp(criterion: Criterion) -> bool:
+    """Whether the exact criterion has no gradient everywhere, so that a smooth form of it is searched with."""
+    if isinstance(criterion, Eliminating):
+        return is_sharp(criterion.inner)
+    several = isinstance(criterion, WorstAccuracy) and len(criterion.weights) > 1
+    smallest = isinstance(criterion, PowerMean) and criterion.smallest
+    return several or smallest or isinstance(criterion, EigenvalueRatio)
 
 
 def accuracy_weights(jacobians: FloatArray) -> FloatArray:

@@ -16,8 +16,15 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.error_model import FELT, Poses, covariance, error_variance
-from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
-from calib_planner.planning.certify.prove import Proof, prove_bound
+from calib_planner.errors import InfeasibleError
+from calib_planner.planning.bound import (
+    ApproximateDesign,
+    DesignProblem,
+    approximate_design,
+    maximised,
+    raised,
+)
+from calib_planner.planning.certify.prove import USUAL_WORK, Proof, prove_bound
 from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space, spread_spaces
@@ -35,8 +42,11 @@ AGREEMENT = 2e-4
 """Difference of log values below which two parts of the search have reached the same plan."""
 
 
-DIVIDED = "Its bound may divide measurements among any number of configurations, which no plan can."
-"""Why efficiencies are small with a whole error model."""
+UNEXPLAINED = 0.99
+"""Efficiency below which a plan says how much whole numbers of visits may have to do with it."""
+
+ROUNDING = 1e-9
+"""Relative error of Ψ of a plan; one that is better than its bound by more has shown that the bound was wrong."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +98,8 @@ def plan(
     rng = np.random.default_rng(own)
     design = _approximate(space, target, rng, clock.over) if target.concave else None
     proof = None
-    if prove and design is not None:
-        proof_rng = np.random.default_rng(own.spawn(1)[0])
-        design, proof = prove_bound(_design_problem(space, target), design, proof_rng, cancel=clock.over)
+    if design is not None:
+        design, proof = _proven(space, target, design, np.random.default_rng(own.spawn(1)[0]), clock, prove)
     clock.tell(bound=design.bound if design else None)
     if problem.candidates is not None:
         result = _choose(space, criterion, design, rng, clock)
@@ -168,14 +177,36 @@ def _approximate(
 def _design_problem(space: PlanSpace, criterion: Criterion) -> DesignProblem:
     problem = space.problem
     return DesignProblem(
-        space.single,
+        space.model,
         criterion,
         space.prior,
-        problem.measurements,
+        problem.configurations,
         space.feasibility,
         problem.candidate_array,
-        problem.configurations if problem.once_each else None,
+        problem.once_each,
     )
+
+
+def _proven(
+    space: PlanSpace,
+    criterion: Criterion,
+    design: ApproximateDesign,
+    rng: np.random.Generator,
+    clock: _Clock,
+    prove: bool,
+) -> tuple[ApproximateDesign, Proof | None]:
+    """The design with a proven bound, or with a numerical one that was maximised thoroughly.
+
+    A proof is tried where it is quick. With constraints it is tried on demand only: over the joint limits alone
+    the bound is a looser one.
+    """
+    request, proof = _design_problem(space, criterion), None
+    if prove or request.candidates is not None or not request.feasibility.constraints:
+        work = float("inf") if prove else USUAL_WORK
+        design, proof = prove_bound(request, design, rng, most_work=work, cancel=clock.over)
+    if proof is None or not proof.holds:
+        design = maximised(request, design, rng, clock.over)
+    return design, proof
 
 
 def _search(
@@ -307,14 +338,11 @@ def _assemble(
     plain = problem.criterion == "test_pose" and not problem.compound
     # For the paper's criterion Ψ is that of the figure reported, to the last digit.
     psi = accuracy**-2 if plain else _psi_of(space, target, configurations)
-    proven = proof is not None and proof.holds
-    bound = float("nan")
-    if design is not None:
-        bound = design.bound if proven else max(design.bound, psi)
+    bound = _bound(space, target, design, proof, configurations, psi)
     name = "compound" if problem.compound else problem.criterion
     size, n = len(space.interest), problem.measurements
     value = psi if problem.compound else reported_value(name, psi, size, n)
-    value_bound = bound if problem.compound or not design else reported_value(name, bound, size, n)
+    value_bound = bound.psi if problem.compound or not bound.known else reported_value(name, bound.psi, size, n)
     general = float("inf") if hidden.size else float(np.trace(space.general @ inverse)) + space.general_floor
     status = "cancelled" if clock.cancelled else "time_limit" if clock.late else "ok"
     status = "singular" if (hidden.size or space.blind.any()) and status == "ok" else status
@@ -326,8 +354,7 @@ def _assemble(
         note += " The criterion holds for this choice of parameters."
     if problem.whole_model is not None:
         note += f" Planned for a robot that errs by the error model {problem.whole_model.name!r}."
-        note += " " + DIVIDED if design else ""
-    note += f" {proof.text}" if proof else ""
+    note += bound.text
     quality = PlanQuality(
         predicted_accuracy_per_test_pose=per,
         parameter_std=_parameter_deviations(space, inverse, hidden),
@@ -338,8 +365,10 @@ def _assemble(
         value=value,
         value_bound=value_bound,
         lower_bound=value_bound if name in POSE_CRITERIA else float("nan"),
-        efficiency=_efficiency(name, psi, bound, value, value_bound) if design else float("nan"),
-        bound="proven" if proven else "numerical" if design else "none",
+        efficiency=_efficiency(name, psi, bound.psi, value, value_bound) if bound.known else float("nan"),
+        bound=bound.kind,
+        bound_tolerance=bound.tolerance,
+        rounded_efficiency=bound.rounded,
         status=status,
         message=STATUS[status] + note,
         seconds=clock.seconds,
@@ -361,6 +390,81 @@ def _assemble(
         sigma=problem.instrument.typical,
         quality=quality,
     )
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """The bound as it is reported.
+
+    Attributes:
+        psi: Upper bound on Ψ; NaN if there is none.
+        kind: ``proven``, ``numerical`` or ``none``.
+        tolerance: See ``PlanQuality.bound_tolerance``.
+        rounded: See ``PlanQuality.rounded_efficiency``.
+        text: Sentences for the message.
+    """
+
+    psi: float = float("nan")
+    kind: str = "none"
+    tolerance: float = float("nan")
+    rounded: float = float("nan")
+    text: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a bound."""
+        return self.kind != "none"
+
+
+def _bound(
+    space: PlanSpace,
+    target: Criterion,
+    design: ApproximateDesign | None,
+    proof: Proof | None,
+    configurations: FloatArray,
+    psi: float,
+) -> _Bound:
+    """The bound on Ψ, checked against the plan of value ``psi``."""
+    if design is None:
+        return _Bound()
+    request, text = _design_problem(space, target), ""
+    proven = proof is not None and proof.holds
+    if psi > (1.0 + ROUNDING) * design.bound and not proven:
+        rng = np.random.default_rng(space.problem.search.seed)
+        design = raised(request, design, configurations, rng)
+        text = " The plan was better than its numerical bound, which was wrong and is now raised."
+    if psi > (1.0 + ROUNDING) * design.bound:
+        return _Bound(text=" The plan is better than its bound, which must not be; no bound is given.")
+    bound = max(design.bound, psi)
+    missed = proof.tolerance if proof is not None and proven else design.missed
+    if proof is not None:
+        text += f" {proof.text}"
+    if not proven:
+        text += f" Further starts of the maximisation raised the bound by less than {100 * missed:.1g} %."
+    name = "compound" if space.problem.compound else space.problem.criterion
+    power = 0.5 if name in POSE_CRITERIA else 1.0
+    rounded = float("nan")
+    if 0.0 < psi < UNEXPLAINED ** (1.0 / power) * bound:
+        rounded = (_rounded(space, target, design) / bound) ** power
+    if np.isfinite(rounded):
+        text += (
+            " The bound may divide visits, which no plan can: rounded to whole ones at its own configurations,"
+            f" its design has efficiency {rounded:.3f}."
+        )
+    return _Bound(bound, "proven" if proven else "numerical", missed, rounded, text)
+
+
+def _rounded(space: PlanSpace, target: Criterion, design: ApproximateDesign) -> float:
+    """Ψ of the best whole-number plan, as far as exchange finds it, at the configurations of the design."""
+    wanted = target if space.problem.compound else space.search_criterion()
+    try:
+        chosen = choose(
+            replace(_choice(space, wanted, design.support, design), repeat=True),
+            np.random.default_rng(space.problem.search.seed),
+        )
+    except InfeasibleError:  # some of its weight is on the spread that keeps it regular
+        return float("nan")
+    return _psi_of(space, target, design.support[chosen.rows])
 
 
 def _terms(space: PlanSpace, inverse: FloatArray) -> tuple[PlannedTerm, ...]:

@@ -58,6 +58,10 @@ class PlanQuality:
         efficiency: Value over bound in the criterion's own convention, at most 1: for accuracies
             lower_bound / value, for D (det M / det M*)^(1/p).
         bound: ``"numerical"`` (the sensitivity was maximised by search), ``"proven"``, or ``"none"``.
+        bound_tolerance: By how much the bound may be off, as a share of Ψ: of a proven one, how closely it was
+            computed; of a numerical one, the rise below which the search for a larger sensitivity ended.
+        rounded_efficiency: Efficiency of the approximate design rounded to whole visits at its configurations,
+            where the plan's own is below ``planner.UNEXPLAINED``; NaN elsewhere. See ``bound``.
         status: A key of ``STATUS``.
         message: What the status means and what to do.
         seconds: Time spent.
@@ -80,6 +84,8 @@ class PlanQuality:
     lower_bound: float = NAN
     efficiency: float = NAN
     bound: str = "none"
+    bound_tolerance: float = NAN
+    rounded_efficiency: float = NAN
     status: str = "ok"
     message: str = ""
     seconds: float = 0.0
@@ -150,7 +156,9 @@ class Plan:
         """
         quality = self.quality
         model = {"name": quality.error_model, "terms": [asdict(t) for t in quality.terms]}
-        return plain(self.values() | {"accuracy_frame": quality.accuracy_frame, "error_model": model})
+        beside = ("bound_tolerance", "rounded_efficiency", "accuracy_frame")
+        more: dict[str, Any] = {name: getattr(quality, name) for name in beside}
+        return plain(self.values() | more | {"error_model": model})
 
 
 KEYS = (

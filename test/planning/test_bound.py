@@ -11,14 +11,22 @@ from robots import mixed, random_configurations, repeats
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
 from calib_planner.error_model import Prior
-from calib_planner.planning import Candidates, Search, plan_space
-from calib_planner.planning.bound import DesignProblem, approximate_design, maximise_sensitivity
+from calib_planner.planning import Candidates, Search, bound, plan_space, planner
+from calib_planner.planning.bound import (
+    DesignProblem,
+    approximate_design,
+    heights_of,
+    maximise_sensitivity,
+    maximised,
+    raised,
+)
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, square_root
 from calib_planner.planning.certify.prove import _scale, prove_bound, prove_maximum
 from calib_planner.planning.criteria import Accuracy, Determinant, Eliminating, PowerMean
 from calib_planner.planning.information import PlanSpace
+from calib_planner.planning.search.descent import Descent
 from calib_planner.planning.search.multistart import SearchProblem, search_chunk
 from calib_planner.robot import Element
 from calib_planner.tracker import LaserTracker
@@ -73,8 +81,8 @@ def random_problem(seed: int) -> PlanProblem:
 
 def design_problem(space: PlanSpace) -> DesignProblem:
     criterion = space.criterion(space.problem.criterion)
-    n = space.problem.measurements
-    return DesignProblem(space.single, criterion, space.prior, n, space.feasibility)
+    visits = space.problem.configurations
+    return DesignProblem(space.model, criterion, space.prior, visits, space.feasibility)
 
 
 def proven(problem: PlanProblem, rounds: int = 60):
@@ -118,10 +126,10 @@ def test_no_plan_of_a_random_chain_beats_its_bound(block):
             continue
         asked, tests = design_problem(space), space.problem.test_pose_array
         design = approximate_design(asked, tests, np.random.default_rng(seed), rounds=4)
-        proof = prove_maximum(space.single, asked.criterion, design.gradient, design.support)
+        proof = prove_maximum(space.model, asked.criterion, design.gradient, design.support)
         assert proof.status == "proven"
         assert proof.tolerance <= 1.1e-4
-        ceiling = proof.ceiling(space.prior, asked.measurements) * (1 + SLACK)
+        ceiling = proof.ceiling(space.prior, asked.visits) * (1 + SLACK)
         assert design.value <= ceiling
         assert best_of_random_plans(space, 40, seed) <= ceiling
         assert best_worth_of_search(space, design.support, design.weights, seed) <= ceiling
@@ -156,7 +164,7 @@ def test_equation_20_to_the_tolerance_of_the_proof():
         angle = np.arccos((1 - abs(np.sin(q0[1]))) / np.cos(q0[1]))  # (19)
         matrix = 0.5 * m * space.model.at(np.array([[0.0, angle], [0.0, -angle]])).sum(axis=0)
         slope = asked.criterion.supporting_gradient(matrix)
-        proof = prove_maximum(space.single, asked.criterion, slope, np.array([[0.0, angle]]), tolerance=1e-8)
+        proof = prove_maximum(space.model, asked.criterion, slope, np.array([[0.0, angle]]), tolerance=1e-8)
         ceiling = proof.ceiling(space.prior, m)
         assert 1.0 - 1e-12 <= ceiling * (1 + abs(np.sin(q0[1]))) / m <= 1.0 + 1e-7
 
@@ -339,7 +347,114 @@ def test_candidates_are_proven_by_looking_at_every_candidate():
     assert found.quality.lower_bound <= found.quality.predicted_accuracy * (1 + SLACK)
 
 
-def test_without_prove_nothing_claims_to_be_proven():
-    found = plan(PlanProblem(Robot.load("planar_2r"), [0.3, 0.5], 4, search=Search(starts=4)))
-    assert found.quality.bound == "numerical"
-    assert "proven" not in found.quality.message
+def test_every_plan_tries_a_proof_and_says_what_it_is_worth():
+    robot = Robot.load("kuka_kr270")
+    found = plan(PlanProblem(robot, TEST_POSE, 12, search=Search(starts=4)))
+    assert found.quality.bound == "proven"
+    assert found.quality.bound_tolerance <= 1.1e-4
+    assert "proven" in found.quality.message
+    # A robot whose proof takes longer has a numerical bound, unless the proof is asked for.
+    whole = PlanProblem(robot.with_parameters("lengths", ("base",)), TEST_POSE, 6, search=Search(starts=4))
+    space = plan_space(whole)
+    asked, rng = design_problem(space), np.random.default_rng(0)
+    design = approximate_design(asked, whole.test_pose_array, rng)
+    few, early = prove_bound(asked, design, rng, most_work=1e5)
+    assert early.status == "work" and not early.holds
+    assert few.bound == design.bound
+    twice = [prove_bound(asked, design, np.random.default_rng(1), most_work=4e6) for _ in range(2)]
+    assert twice[0][0].bound == twice[1][0].bound
+    assert twice[0][1].boxes == twice[1][1].boxes
+
+
+# ── repetitions, and bounds that a plan has beaten ───────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("model", ["paper", "tracker"])
+def test_the_bound_is_for_the_repetitions_that_are_asked_for(model):
+    """4 × 3 with an error of the configuration is a plan of four visits, as one with smaller noise is."""
+    robot = Robot.load("kuka_kr270")
+    sigma, own, r = 3e-5, 3e-5, 3
+    noise = sigma if model == "paper" else LaserTracker(station=[6.0, 0.0, 1.0])
+    fast = Search(starts=6)
+    repeated = plan(
+        PlanProblem(robot, TEST_POSE, 4, r, noise=noise, configuration_sigma=own, search=fast)
+    ).quality
+    assert repeated.efficiency > 0.97
+    if model == "paper":
+        alike = plan(PlanProblem(robot, TEST_POSE, 4, noise=np.sqrt(sigma**2 / r + own**2), search=fast)).quality
+        assert repeated.value_bound == pytest.approx(alike.value_bound, rel=2e-3)
+        assert repeated.predicted_accuracy == pytest.approx(alike.predicted_accuracy, rel=2e-3)
+
+
+def test_repeated_configurations_never_tell_more_than_their_visits():
+    """Two visits to one place whose error is that of the place tell less than the bound counts."""
+    robot = Robot.load("kuka_kr270")
+    model = plan_space(PlanProblem(robot, TEST_POSE, 4, 3, configuration_sigma=2e-5)).model
+    together = dataclasses.replace(model, repetitions=2 * model.repetitions)
+    q = random_configurations(robot, 20, 3)
+    assert np.linalg.eigvalsh(2.0 * model.at(q) - together.at(q)).min() > -1e-6 * model.at(q).max()
+
+
+def lazy(objective, start, low, high, **settings):
+    """A descent that does not descend."""
+    value, _ = objective(start)
+    return Descent(start, value, len(start))
+
+
+def tracker_problem(seed=0):
+    noise = LaserTracker(station=[4.0, 0.0, 1.0])
+    return PlanProblem(Robot.load("planar_2r"), [0.3, 0.5], 4, noise=noise, search=Search(starts=6, seed=seed))
+
+
+def test_a_bound_that_a_plan_has_beaten_is_raised_from_that_plan(monkeypatch):
+    """With a maximiser that fails, the numerical bound is too low; nobody hides it."""
+    problem = tracker_problem()
+    space = plan_space(problem)
+    good = plan(problem).quality
+    psi = good.predicted_accuracy**-2
+
+    def too_low(asked, design, *rest):
+        return dataclasses.replace(design, bound=0.9 * psi, missed=1e-4)
+
+    monkeypatch.setattr(planner, "maximised", too_low)
+    mended = plan(problem).quality
+    assert "which was wrong and is now raised" in mended.message
+    assert mended.bound == "numerical"
+    assert mended.efficiency <= 1.0
+    # What it is raised to is a maximum of d near the plan, not the plan's own value.
+    assert mended.lower_bound == pytest.approx(good.lower_bound, rel=2e-3)
+    # Even with a maximiser that does nothing, the heights at the plan's configurations are enough.
+    monkeypatch.setattr(bound, "descend", lazy)
+    asked, rng = design_problem(space), np.random.default_rng(0)
+    design = dataclasses.replace(approximate_design(asked, problem.test_pose_array, rng, rounds=2), bound=0.0)
+    q = plan(problem).configurations
+    value = asked.criterion.exact(space.model.totals(q, 4)[0] + space.prior)
+    assert raised(asked, design, q, rng).bound >= value * (1 - SLACK)
+
+
+def test_a_proof_that_a_plan_has_beaten_is_no_bound(monkeypatch):
+    """This cannot happen; if it does nevertheless, nothing is claimed."""
+
+    def wrong(asked, design, *rest, **settings):
+        proved, proof = prove_bound(asked, design, *rest, **settings)
+        return dataclasses.replace(proved, bound=0.5 * proved.bound), proof
+
+    monkeypatch.setattr(planner, "prove_bound", wrong)
+    found = plan(PlanProblem(Robot.load("planar_2r"), [0.3, 0.5], 4, search=Search(starts=4))).quality
+    assert found.bound == "none" and np.isnan(found.efficiency)
+    assert "must not be" in found.message
+
+
+def test_a_numerical_bound_is_maximised_until_more_starts_do_not_raise_it(monkeypatch):
+    problem = tracker_problem()
+    asked, rng = design_problem(plan_space(problem)), np.random.default_rng(0)
+    with monkeypatch.context() as patched:
+        patched.setattr(bound, "descend", lazy)
+        rough = approximate_design(asked, problem.test_pose_array, rng, rounds=1)
+        low = dataclasses.replace(rough, bound=0.5 * rough.bound)
+    better = maximised(asked, low, rng, lambda: False)
+    assert better.missed == bound.MAY_MISS
+    q = random_configurations(problem.robot, 20_000, 5)
+    top = heights_of(better, q).max()
+    assert better.bound >= (better.ground + asked.visits * top) * (1 - SLACK)
+    assert "raised the bound by less than 0.01 %" in plan(problem).quality.message

@@ -1,7 +1,7 @@
 """A proof of the bound: a rigorous upper bound on the largest sensitivity, by branch and bound.
 
-By (B) of ``criteria`` a bound on every plan of n measurements follows from any gradient G = S Sᵀ once an upper
-bound on max_q d(q) is certain, d(q) = tr(G I_1(q)). With isotropic noise d is a polynomial (see ``polynomial``),
+By (B) of ``criteria`` a bound on every plan of m visits follows from any gradient G = S Sᵀ once an upper
+bound on max_q d(q) is certain, d(q) = tr(G I_r(q)). With isotropic noise d is a polynomial (see ``polynomial``),
 and ``branch_and_bound`` on its Bernstein form finds its largest value, with an allowance for rounding. What G may
 lack in being a gradient of Ψ is allowed for as well, where the largest c with c Ψ(M) ≤ tr(G M) for all M has a
 closed form:
@@ -13,6 +13,9 @@ closed form:
 For the other criteria G is taken as the gradient that it is up to rounding. Constraints only shrink the set of
 plans: a bound over the joint limits holds for them too. With a laser tracker's noise d is no polynomial: its
 bound stays numerical.
+
+Every plan tries a proof, with an amount of work that is counted in coefficients and not in seconds: the same seed
+gives the same answer on any machine. A proof that is asked for runs to its end.
 """
 
 from __future__ import annotations
@@ -24,7 +27,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.planning.bound import ApproximateDesign, DesignProblem, approximate_design
+from calib_planner.planning.bound import (
+    ApproximateDesign,
+    DesignProblem,
+    approximate_design,
+    continued,
+    heights_of,
+)
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, sensitivity, square_root
 from calib_planner.planning.criteria import Accuracy, Criterion, Determinant, Eliminating, PowerMean
@@ -36,13 +45,20 @@ TOLERANCE = 1e-4
 """Relative, of d; half of it for ρ0."""
 TIME_LIMIT = 20.0
 LARGEST_GRID = 5**8
+USUAL_WORK = 2.5e7
+"""Coefficients of boxes that a plan bounds without being asked for a proof: 0.1 to 0.3 s."""
+USUAL_GRID = 5**6
+"""Nodes that it samples d at for that, 10 to 20 ms."""
 ROUNDS = 4
 MISSED = 5e-4
 """A maximum this much above what search had seen, relative, justifies another approximate design."""
+LOOSE = 2e-3
+"""How far, relative, a bound that is proven with limited work may be above the numerical one and replace it."""
 
 PROOF_STATUS = {
     "proven": "The bound is proven",
     "time_limit": "The bound is proven, less closely than wanted because time was up",
+    "work": "The bound is numerical: the proof takes longer than a plan should, ask for it (--prove)",
     "model": "The bound stays numerical: with a whole error model the sensitivity is no polynomial of the joints",
     "noise": "The bound stays numerical: only isotropic noise makes the sensitivity a polynomial",
     "joints": "The bound stays numerical: too many joints for a proof",
@@ -65,6 +81,7 @@ class Proof:
         active: Indices of the joints on which d depends.
         seconds: Time spent.
         status: A key of ``PROOF_STATUS``.
+        work: Coefficients of all boxes.
     """
 
     maximum_upper: float
@@ -76,6 +93,7 @@ class Proof:
     active: tuple[int, ...]
     seconds: float
     status: str
+    work: int = 0
 
     @property
     def holds(self) -> bool:
@@ -87,10 +105,10 @@ class Proof:
         """How far ``maximum_upper`` is above ``largest_seen``, relative."""
         return self.maximum_upper / self.largest_seen - 1.0 if self.largest_seen > 0 else float("inf")
 
-    def ceiling(self, prior: FloatArray, measurements: int) -> float:
-        """Upper bound on Ψ of any plan of so many measurements, M_0 = ``prior`` (p, p)."""
+    def ceiling(self, prior: FloatArray, visits: int) -> float:
+        """Upper bound on Ψ of any plan of so many visits, M_0 = ``prior`` (p, p)."""
         known = float(np.sum(self.gradient * prior)) * (1.0 + 1e-12)
-        return (known + measurements * self.maximum_upper) / self.scale
+        return (known + visits * self.maximum_upper) / self.scale
 
     @property
     def text(self) -> str:
@@ -107,24 +125,36 @@ def prove_bound(
     *,
     tolerance: float = TOLERANCE,
     time_limit: float = TIME_LIMIT,
+    most_work: float = float("inf"),
     cancel: Callable[[], bool] = lambda: False,
 ) -> tuple[ApproximateDesign, Proof]:
     """Turn the bound of ``design`` into a proven one.
 
-    A maximum of d that search had missed joins the support of the next approximate design, so that a bound once
-    refuted comes back almost as good. Constraints are put aside: the proof is over the joint limits.
+    A maximum of d that search had missed joins the support of the design, which then grows on, so that a bound
+    once refuted comes back almost as good. Constraints are put aside: the proof is over the joint limits.
+
+    Args:
+        problem: What the bound is of.
+        design: Where to begin.
+        rng: Of random configurations.
+        tolerance: How close the largest sensitivity shall be enclosed, relative.
+        time_limit: Seconds; what has been proven by then is returned.
+        most_work: Coefficients of boxes; where they do not suffice for a bound as close as the numerical one,
+            nothing is proven.
+        cancel: Called now and then; ``True`` ends the work as the time limit does.
 
     Returns:
         The design with the smallest proven bound, and its proof; the design unchanged if nothing is proven.
     """
-    if problem.candidates is not None and not isinstance(problem.model, ExtendedModel):
-        return design, _prove_candidates(problem, problem.candidates, design.gradient)
+    if problem.candidates is not None:
+        return design, _prove_candidates(problem, problem.candidates, design)
     deadline = time.perf_counter() + time_limit
     free = replace(problem, feasibility=replace(problem.feasibility, constraints=()))
     bounded, tried = bool(problem.feasibility.constraints), design
     if bounded and not _obstacle(problem.model):
         tried = approximate_design(free, design.support, rng, cancel)
-    best: tuple[float, Proof] | None = None
+    numerical = design.bound
+    best: tuple[float, Proof, float] | None = None
     for _ in range(ROUNDS):
         proof = prove_maximum(
             problem.model,
@@ -133,22 +163,26 @@ def prove_bound(
             tried.support,
             tolerance=tolerance,
             time_limit=max(deadline - time.perf_counter(), 1e-3),
+            most_work=most_work,
             cancel=cancel,
         )
         if not proof.holds:
             return design, proof
-        ceiling = proof.ceiling(problem.prior, problem.measurements)
+        ceiling = proof.ceiling(problem.prior, problem.visits)
         if best is None or ceiling < best[0]:
-            best = ceiling, proof
+            best = ceiling, proof, tried.ground
         if tried.value > design.value and not bounded:
             design = tried
+        most_work -= proof.work
         missed = ceiling > (1.0 + MISSED + proof.tolerance) * tried.bound
-        if not missed or cancel() or time.perf_counter() > deadline:
+        if not missed or cancel() or time.perf_counter() > deadline or proof.status == "work":
             break
-        strong = tried.support[tried.weights > 1e-3]
-        tried = approximate_design(free, np.concatenate([strong, proof.where[None]]), rng, cancel)
+        tried = continued(free, tried, proof.where[None], rng, cancel)
     assert best is not None
-    return replace(design, bound=best[0], gradient=best[1].gradient), best[1]
+    ceiling, proof, ground = best
+    if proof.status == "work" and ceiling > (1.0 + LOOSE) * max(numerical, design.value):
+        return design, replace(proof, maximum_upper=np.inf)
+    return replace(design, bound=ceiling, gradient=proof.gradient, ground=ground), proof
 
 
 def prove_maximum(
@@ -159,29 +193,40 @@ def prove_maximum(
     *,
     tolerance: float = TOLERANCE,
     time_limit: float = TIME_LIMIT,
+    most_work: float = float("inf"),
     cancel: Callable[[], bool] = lambda: False,
 ) -> Proof:
-    """Bound d(q) = tr(``gradient`` I(q)) over the joint limits.
+    """Bound d(q) = tr(``gradient`` I_r(q)) over the joint limits.
 
     Args:
-        model: Information of one measurement.
+        model: Information of one visit.
         criterion: What ``gradient`` is a gradient of.
         gradient: (p, p) G, positive semi-definite.
         known: (K, joints) configurations within the limits where d is large, K ≥ 1.
         tolerance: How close maximum_upper shall come to largest_seen, relative.
         time_limit: Seconds; what has been proven by then is returned.
+        most_work: Coefficients of boxes after which the same happens.
         cancel: Called now and then; ``True`` ends the work as the time limit does.
     """
     began = time.perf_counter()
     root = square_root(gradient)
     reason = _obstacle(model)
+    if not reason and np.isfinite(most_work) and _grid(model) > USUAL_GRID:
+        reason = "work"
     if reason or isinstance(model, ExtendedModel):
         return Proof(np.inf, np.nan, known[0], root @ root.T, 1.0, 0, (), 0.0, reason)
     values, _ = sensitivity(model, root, known)
     d = polynomial(model, root)
     top = maximise(
-        d.axes, d.tensor, float(values.max()), tolerance=tolerance, time_limit=time_limit, cancel=cancel
+        d.axes,
+        d.tensor,
+        float(values.max()),
+        tolerance=tolerance,
+        time_limit=time_limit,
+        most_work=most_work,
+        cancel=cancel,
     )
+    work = top.boxes * d.tensor.size
     where = known[int(np.argmax(values))].copy()
     if top.where is not None:
         where[list(d.active)] = top.where
@@ -194,16 +239,17 @@ def prove_maximum(
         boxes=top.boxes,
         active=d.active,
         seconds=time.perf_counter() - began,
-        status="time_limit" if top.late else "proven",
+        status="proven" if not top.late else "work" if work > most_work else "time_limit",
+        work=work,
     )
 
 
-def _prove_candidates(problem: DesignProblem, candidates: FloatArray, gradient: FloatArray) -> Proof:
-    """Over candidates (C, joints) with any noise: every d is computed, the bound is exact already."""
+def _prove_candidates(problem: DesignProblem, candidates: FloatArray, design: ApproximateDesign) -> Proof:
+    """Over candidates (C, joints), with any model: every d is computed, the bound is exact already."""
     q = candidates[problem.feasibility.mask(candidates)]
-    d = np.einsum("nab,ab->n", problem.model.at(q), gradient)
+    d = heights_of(design, q)
     best = int(np.argmax(d))
-    return Proof(float(d[best]), float(d[best]), q[best], gradient, 1.0, len(q), (), 0.0, "candidates")
+    return Proof(float(d[best]), float(d[best]), q[best], design.gradient, 1.0, len(q), (), 0.0, "candidates")
 
 
 def _obstacle(model: Model) -> str:
@@ -212,8 +258,13 @@ def _obstacle(model: Model) -> str:
         return "model"
     if not isinstance(model.noise, Isotropic):
         return "noise"
+    return "joints" if _grid(model) > LARGEST_GRID else ""
+
+
+def _grid(model: Model) -> float:
+    """Nodes at which d is sampled."""
     turns = model.robot.joint_is_revolute
-    return "joints" if 5.0 ** turns.sum() * 3.0 ** (~turns).sum() > LARGEST_GRID else ""
+    return float(5.0 ** turns.sum() * 3.0 ** (~turns).sum())
 
 
 def _scale(criterion: Criterion, root: FloatArray) -> float:
