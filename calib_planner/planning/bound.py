@@ -50,7 +50,7 @@ from calib_planner.planning.information import Model
 from calib_planner.planning.search.descent import Descent, climb, descend
 
 SPREAD = 256
-POOL = 400
+DRAWN_FIRST = 400
 """Random configurations that share the first measure: a good one has some of them near its own."""
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
 """Weight of a spread of random configurations in every measure, first and last. The optimum is often singular:
@@ -158,15 +158,15 @@ def _first_measure(
     problem: DesignProblem, start: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Configurations (K, joints), weights (K,) and the mean information everywhere (p, p)."""
-    pool = np.concatenate([start, problem.feasibility.sample(rng, POOL)])
-    unit = problem.model.at(pool)
+    drawn = np.concatenate([start, problem.feasibility.sample(rng, DRAWN_FIRST)])
+    unit = problem.model.at(drawn)
     everywhere = unit[len(start) :].mean(axis=0)
     ground = problem.prior + problem.visits * FIRST_FLOOR * everywhere
-    equal: FloatArray = np.full(len(pool), 1.0 / len(pool))
+    equal: FloatArray = np.full(len(drawn), 1.0 / len(drawn))
     weights, _ = _reweighted(problem.criterion, problem.visits * unit, equal, ground, iterations=40, exponent=1.0)
     heaviest = np.argsort(-weights)[: max(40, len(ground))]
     heaviest = heaviest[weights[heaviest] > 1e-4]
-    return pool[heaviest], weights[heaviest] / weights[heaviest].sum(), everywhere
+    return drawn[heaviest], weights[heaviest] / weights[heaviest].sum(), everywhere
 
 
 FALL = 0.5
@@ -255,7 +255,7 @@ def _better(best: ApproximateDesign | None, new: ApproximateDesign) -> Approxima
 # ── what a numerical bound may have missed ───────────────────────────────────────────────────────────────
 
 MAY_MISS = 1e-4
-"""Relative rise of the bound, half of it for ρ0, that is not worth another batch of starts: less than what the
+"""Relative rise of the bound, half of it for ρ0, that justifies no further batch of starts: less than what the
 measure leaves open."""
 QUIET, MOST_BATCHES = 2, 8
 """Batches in succession that raise the bound by less than that before the maximisation ends; most of them."""

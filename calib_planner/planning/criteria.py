@@ -114,6 +114,9 @@ class Accuracy(_Smooth):
         psi = 1.0 / np.einsum("sii->s", half)
         return np.asarray(psi, np.float64), _symmetric((psi**2)[:, None, None] * (half @ inverse))
 
+    def exact_values(self, matrices: FloatArray) -> FloatArray:
+        return np.asarray(1.0 / np.einsum("sab,ba->s", np.linalg.inv(matrices), self.weight))
+
 
 @dataclass(frozen=True)
 class WorstAccuracy(_Exact):

@@ -30,7 +30,8 @@ from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space, spread_spaces
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import STATUS, Plan, PlannedTerm, PlanQuality
-from calib_planner.planning.search.exchange import ChoiceProblem, choose
+from calib_planner.planning.search.enumeration import best_of_all
+from calib_planner.planning.search.exchange import ChoiceProblem, check_choice, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
@@ -101,11 +102,12 @@ def plan(
     if design is not None:
         design, proof = _proven(space, target, design, np.random.default_rng(own.spawn(1)[0]), clock, prove)
     clock.tell(bound=design.bound if design else None)
+    best: _Bound | None = None
     if problem.candidates is not None:
-        result = _choose(space, criterion, design, rng, clock)
+        result, best = _choose(space, criterion, target, design, rng, clock)
     else:
         result = _search(space, criterion, design, seeds, clock, executor)
-    return _assemble(space, target, design, proof, result, clock)
+    return _assemble(space, target, design, proof, best, result, clock)
 
 
 def value_of(problem: PlanProblem, configurations: FloatArray) -> float:
@@ -275,21 +277,36 @@ def _good_enough(space: PlanSpace, design: ApproximateDesign | None, best: Searc
 def _choose(
     space: PlanSpace,
     criterion: Criterion,
+    target: Criterion,
     design: ApproximateDesign | None,
     rng: np.random.Generator,
     clock: _Clock,
-) -> SearchResult:
+) -> tuple[SearchResult, _Bound | None]:
+    """The choice, and the bound where every choice there is was evaluated."""
     problem = space.problem
     candidates = np.asarray(problem.candidate_array)
-    allowed = np.flatnonzero(space.feasibility.mask(candidates))
-    request = _choice(space, criterion, candidates[allowed], design)
+    allowed = candidates[space.feasibility.mask(candidates)]
+    request = _choice(space, criterion, allowed, design)
+    check_choice(request)
     if request.together is not None:
         others = spread_spaces(space)
-        beside = (_choice(s, _criterion_of(s, criterion), candidates[allowed], design) for s in others)
+        beside = (_choice(s, _criterion_of(s, criterion), allowed, design) for s in others)
         request = replace(request, beside=tuple(beside))
-    chosen = choose(request, rng, clock.over)
-    clock.tell(problem.starts, chosen.log_value)
-    return SearchResult(candidates[allowed[chosen.rows]], chosen.log_value, chosen.starts, chosen.evaluations)
+    one = criterion is target or problem.criterion != "test_pose" or problem.general_weight == 0.0
+    exact = replace(request, criterion=target) if one else request
+    every = best_of_all(exact, target, lambda matrix: _psi_of_matrix(space, target, matrix), clock.over)
+    if every is None:
+        chosen = choose(request, rng, clock.over)
+        clock.tell(problem.starts, chosen.log_value)
+        return SearchResult(allowed[chosen.rows], chosen.log_value, chosen.starts, chosen.evaluations), None
+    clock.tell(problem.starts, every.log_value)
+    psi = _psi_of(space, target, allowed[every.top_rows])
+    text = f" The bound is proven: each of the {every.choices} choices there are was evaluated."
+    if not one:
+        sizes = " and over several sizes of the robot's errors" if request.beside else ""
+        text += f" The plan is the best of them with a share for accuracy everywhere{sizes}."
+    result = SearchResult(allowed[every.rows], every.log_value, 1, every.choices)
+    return result, _Bound(psi, "proven", 0.0, text=text)
 
 
 def _choice(
@@ -322,6 +339,7 @@ def _assemble(
     target: Criterion,
     design: ApproximateDesign | None,
     proof: Proof | None,
+    best: _Bound | None,
     result: SearchResult,
     clock: _Clock,
 ) -> Plan:
@@ -337,8 +355,10 @@ def _assemble(
     accuracy = float(np.sqrt(shares[shares > 0] @ per[shares > 0] ** 2)) if len(per) else float("nan")
     plain = problem.criterion == "test_pose" and not problem.compound
     # For the paper's criterion Ψ is that of the figure reported, to the last digit.
+    floor = float(shares @ space.test_floor) if plain else 0.0
     psi = accuracy**-2 if plain else _psi_of(space, target, configurations)
-    bound = _bound(space, target, design, proof, configurations, psi)
+    bound = best or _bound(space, target, design, proof, configurations)
+    bound = _checked(bound.above(floor), psi)
     name = "compound" if problem.compound else problem.criterion
     size, n = len(space.interest), problem.measurements
     value = psi if problem.compound else reported_value(name, psi, size, n)
@@ -415,6 +435,17 @@ class _Bound:
         """Whether there is a bound."""
         return self.kind != "none"
 
+    def above(self, floor: float) -> _Bound:
+        """The bound on ρ0⁻² where ρ0² has a part ``floor`` [m²] that no measurement changes."""
+        return replace(self, psi=1.0 / (1.0 / self.psi + floor)) if floor and self.psi > 0.0 else self
+
+
+def _checked(bound: _Bound, psi: float) -> _Bound:
+    """The bound, if the plan of value ``psi`` is not better than it by more than rounding."""
+    if psi > (1.0 + ROUNDING) * bound.psi:
+        return _Bound(text=" The plan is better than its bound, which must not be: no bound is given.")
+    return replace(bound, psi=max(bound.psi, psi)) if bound.known else bound
+
 
 def _bound(
     space: PlanSpace,
@@ -422,36 +453,31 @@ def _bound(
     design: ApproximateDesign | None,
     proof: Proof | None,
     configurations: FloatArray,
-    psi: float,
 ) -> _Bound:
-    """The bound on Ψ, checked against the plan of value ``psi``."""
+    """The bound on Ψ of the design, raised where the plan shows that its maximisation had missed something."""
     if design is None:
         return _Bound()
-    request, text = _design_problem(space, target), ""
+    psi, text = _psi_of(space, target, configurations), ""
     proven = proof is not None and proof.holds
     if psi > (1.0 + ROUNDING) * design.bound and not proven:
         rng = np.random.default_rng(space.problem.search.seed)
-        design = raised(request, design, configurations, rng)
+        design = raised(_design_problem(space, target), design, configurations, rng)
         text = " The plan was better than its numerical bound, which was wrong and is now raised."
-    if psi > (1.0 + ROUNDING) * design.bound:
-        return _Bound(text=" The plan is better than its bound, which must not be; no bound is given.")
-    bound = max(design.bound, psi)
     missed = proof.tolerance if proof is not None and proven else design.missed
     if proof is not None:
         text += f" {proof.text}"
     if not proven:
         text += f" Further starts of the maximisation raised the bound by less than {100 * missed:.1g} %."
-    name = "compound" if space.problem.compound else space.problem.criterion
-    power = 0.5 if name in POSE_CRITERIA else 1.0
+    power = 0.5 if space.problem.criterion in POSE_CRITERIA and not space.problem.compound else 1.0
     rounded = float("nan")
-    if 0.0 < psi < UNEXPLAINED ** (1.0 / power) * bound:
-        rounded = (_rounded(space, target, design) / bound) ** power
+    if 0.0 < psi < UNEXPLAINED ** (1.0 / power) * design.bound:
+        rounded = (_rounded(space, target, design) / design.bound) ** power
     if np.isfinite(rounded):
         text += (
             " The bound may divide visits, which no plan can: rounded to whole ones at its own configurations,"
             f" its design has efficiency {rounded:.3f}."
         )
-    return _Bound(bound, "proven" if proven else "numerical", missed, rounded, text)
+    return _Bound(design.bound, "proven" if proven else "numerical", missed, rounded, text)
 
 
 def _rounded(space: PlanSpace, target: Criterion, design: ApproximateDesign) -> float:
@@ -525,6 +551,11 @@ def _efficiency(name: str, psi: float, bound: float, value: float, value_bound: 
 def _psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
     """Ψ of a plan; 0 where it is blind to what the criterion needs."""
     matrix = space.model.totals(configurations, len(configurations))[0] + space.prior
+    return _psi_of_matrix(space, criterion, matrix)
+
+
+def _psi_of_matrix(space: PlanSpace, criterion: Criterion, matrix: FloatArray) -> float:
+    """Ψ of an information matrix (p, p), which may be singular."""
     hidden = covariance(matrix)[1]
     return 0.0 if _blind(space, hidden) else criterion.exact(_regular(matrix, hidden))
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
+from math import comb
 
 import numpy as np
 import pytest
 from robots import SHARED_DATA, random_configurations
 
 from calib_planner import Robot
+from calib_planner.error_model import typical
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning import Candidates, PlanProblem, Search, plan
 from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
+from calib_planner.planning.planner import value_of
+from calib_planner.planning.search.enumeration import best_of_all, choices_of
 from calib_planner.planning.search.exchange import ChoiceProblem, RunningDeterminant, choose, scaled_rows
+from calib_planner.tracker import Isotropic
 
 P = 4
 CRITERIA = {
@@ -144,6 +150,65 @@ def test_plans_from_candidates(criterion: str) -> None:
         assert found.quality.bound == "none"
     else:
         assert 0.5 < found.quality.efficiency <= 1.0
+
+
+SMALL = [(c, m) for c in ("test_pose", "worst_pose", "d", "a", "e", "o4") for m in (3, 4)]
+
+
+@pytest.mark.parametrize(("criterion", "m"), SMALL)
+@pytest.mark.parametrize("repeat", [False, True])
+def test_of_few_choices_the_plan_is_the_best(criterion: str, m: int, repeat: bool) -> None:
+    """Every choice of a short list, each valued by itself: the plan is the best of them, and says so."""
+    robot, rng = Robot.load("kuka_kr270"), np.random.default_rng(m)
+    candidates = random_configurations(robot, 7, int(rng.integers(1000)))
+    candidates[5] = candidates[2]  # some choices leave parameters unseen
+    problem = PlanProblem(
+        robot,
+        random_configurations(robot, 2, 8),
+        m,
+        criterion=criterion,
+        search=Search(general_weight=0.0),
+        candidates=Candidates(candidates, repeat),
+    )
+    found = plan(problem).quality
+    every = combinations_with_replacement if repeat else combinations
+    values = [value_of(problem, candidates[list(rows)]) for rows in every(range(7), m)]
+    best = min(values) if criterion in ("test_pose", "worst_pose", "a") else max(values)
+    assert found.value == pytest.approx(best, rel=1e-7)
+    assert found.bound == "proven"
+    assert found.efficiency == pytest.approx(1.0, abs=1e-7)
+    assert f"each of the {len(values)} choices" in found.message
+
+
+def test_few_choices_with_a_whole_error_model() -> None:
+    robot = Robot.load("kuka_kr270")
+    candidates, model = random_configurations(robot, 8, 3), replace(typical(Isotropic(3e-5)), name="mine")
+    problem = PlanProblem(
+        robot,
+        random_configurations(robot, 2, 8),
+        3,
+        error_model=model,
+        search=Search(general_weight=0.0),
+        candidates=Candidates(candidates),
+    )
+    found = plan(problem)
+    values = [value_of(problem, candidates[list(rows)]) for rows in combinations(range(8), 3)]
+    assert found.quality.bound == "proven"
+    assert found.quality.value == pytest.approx(min(values), rel=1e-9)
+    assert found.quality.efficiency == pytest.approx(1.0, rel=1e-9)
+    # With a share for accuracy everywhere the plan may differ, the bound may not.
+    shared = plan(replace(problem, search=Search(general_weight=0.3))).quality
+    assert shared.value_bound == pytest.approx(min(values), rel=1e-9)
+    assert shared.efficiency <= 1.0
+    assert "share for accuracy everywhere" in shared.message
+
+
+def test_many_choices_are_not_enumerated() -> None:
+    problem = ChoiceProblem(pool(0, 60), Determinant(), np.zeros((P, P)), 8)
+    assert choices_of(problem) == comb(60, 8)
+    assert best_of_all(problem, problem.criterion, lambda matrix: 0.0) is None
+    few = ChoiceProblem(pool(0, 6), Determinant(), np.zeros((P, P)), 4)
+    assert best_of_all(few, few.criterion, lambda matrix: 0.0, lambda: True) is None
 
 
 def test_repeats_only_when_allowed() -> None:

@@ -259,7 +259,7 @@ def test_candidates_are_exchanged_until_no_other_is_better() -> None:
             if len(set(rows.tolist())) == 5:
                 assert space.search_criterion().exact(_information(request, rows)) <= best * (1 + 1e-3)
     found = plan(problem)
-    assert found.quality.bound == "numerical"
+    assert found.quality.bound == "proven"  # the sensitivity of every candidate is known
     assert found.quality.lower_bound <= found.quality.predicted_accuracy
 
 

@@ -15,7 +15,7 @@ plans: a bound over the joint limits holds for them too. With a laser tracker's 
 bound stays numerical.
 
 Every plan tries a proof, with an amount of work that is counted in coefficients and not in seconds: the same seed
-gives the same answer on any machine. A proof that is asked for runs to its end.
+gives the same answer on any machine. A proof that is required runs to its end.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ TOLERANCE = 1e-4
 TIME_LIMIT = 20.0
 LARGEST_GRID = 5**8
 USUAL_WORK = 2.5e7
-"""Coefficients of boxes that a plan bounds without being asked for a proof: 0.1 to 0.3 s."""
+"""Coefficients of boxes that a plan bounds where no proof is required: 0.1 to 0.3 s."""
 USUAL_GRID = 5**6
 """Nodes that it samples d at for that, 10 to 20 ms."""
 ROUNDS = 4

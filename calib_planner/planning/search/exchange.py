@@ -186,7 +186,7 @@ def choose(
         InfeasibleError: The candidates cannot identify the parameters, whichever rows are chosen; names the
             combinations of parameters that no candidate shows. Or there are fewer candidates than rows.
     """
-    _check(problem)
+    check_choice(problem)
     search: _Exact | _Shortlisted | _Together
     if problem.together is not None:
         search = _Together(problem, problem.together)
@@ -207,7 +207,8 @@ def choose(
     return Choice(best.rows, best.log_value, evaluations, count)
 
 
-def _check(problem: ChoiceProblem) -> None:
+def check_choice(problem: ChoiceProblem) -> None:
+    """Refuse candidates that are too few, or that cannot identify the parameters; see ``choose``."""
     candidates, _, p = problem.rows.shape
     if not candidates or (candidates < problem.size and not problem.repeat):
         raise InfeasibleError(
@@ -246,23 +247,33 @@ def _rounded(problem: ChoiceProblem) -> IntArray:
     return np.repeat(order, counts[order])[: problem.size]
 
 
+def information_of(problem: ChoiceProblem, choices: IntArray) -> FloatArray:
+    """M (S, p, p) of choices (S, size)."""
+    if problem.together is not None and choices.size:
+        return problem.prior + problem.together.rows(choices.ravel()).sums(choices.shape[1])
+    own = problem.rows[choices].reshape(len(choices), -1, problem.rows.shape[2])
+    return problem.prior + np.swapaxes(own, 1, 2) @ own
+
+
 def _information(problem: ChoiceProblem, rows: IntArray) -> FloatArray:
-    if problem.together is not None and len(rows):
-        return problem.prior + problem.together.rows(rows).sums(len(rows))[0]
-    own = problem.rows[rows].reshape(-1, problem.rows.shape[2])
-    return problem.prior + own.T @ own
+    return information_of(problem, rows[None])[0]
 
 
 def _mean_log_value(problem: ChoiceProblem, rows: IntArray) -> float:
     """log Ψ of a choice, the mean over the problem and those beside it."""
     every = (problem, *problem.beside)
-    return float(np.mean([_log_values(p, _information(p, rows)[None])[0] for p in every]))
+    return float(np.mean([log_values_of(p, _information(p, rows)[None])[0] for p in every]))
 
 
-def _log_values(problem: ChoiceProblem, matrices: FloatArray) -> FloatArray:
-    """log Ψ (S,); the ridge is relative to each diagonal element, since rows may be in any units."""
+def log_values_of(problem: ChoiceProblem, matrices: FloatArray) -> FloatArray:
+    """log Ψ (S,) of (S, p, p), with a ridge relative to each diagonal element, since rows may be in any units."""
+    return log_values(problem.criterion, slightly_ridged(matrices))
+
+
+def slightly_ridged(matrices: FloatArray) -> FloatArray:
+    """(S, p, p) with 1e-13 more on the diagonal, relative to each element of it."""
     diagonal = np.einsum("sii->si", matrices)
-    return log_values(problem.criterion, matrices + 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1]))
+    return np.asarray(matrices + 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1]))
 
 
 # ── determinants: all candidates, exactly ────────────────────────────────────────────────────────────
@@ -340,7 +351,7 @@ class _Shortlisted:
     def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         problem, rows = self.problem, self._greedy(start)
         matrix = _information(problem, rows)
-        log_value = float(_log_values(problem, matrix[None])[0])
+        log_value = float(log_values_of(problem, matrix[None])[0])
         tried = 1
         for _ in range(MOST_PASSES):
             improved = False
@@ -351,7 +362,7 @@ class _Shortlisted:
                 candidates = self._shortlist(matrix, rows)
                 if not candidates.size:
                     continue
-                trial = _log_values(problem, without + self._unit(candidates))
+                trial = log_values_of(problem, without + self._unit(candidates))
                 tried += len(candidates)
                 best = int(np.argmax(trial))
                 if trial[best] > log_value + 1e-9:
@@ -467,7 +478,7 @@ def _with_one_more(problem: ChoiceProblem, others: IntArray, new: IntArray) -> F
     added = problem.together.rows(new).given(problem.together.rows(others))
     matrix = _information(problem, others)
     if not isinstance(problem.criterion, Accuracy):
-        return _log_values(problem, matrix + np.swapaxes(added, 1, 2) @ added)
+        return log_values_of(problem, matrix + np.swapaxes(added, 1, 2) @ added)
     inverse = np.linalg.inv(matrix + 1e-13 * np.diag(np.diag(matrix)))
     half = inverse @ problem.criterion.weight
     turned = np.swapaxes(added, 1, 2)
