@@ -95,6 +95,12 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+def clock(seconds: float) -> str:
+    """A time since the beginning as a clock shows it: hours, minutes and seconds."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
 def signed(value: float, digits: int, *, plus: bool = False) -> str:
     """A number with ``digits`` decimals and a true minus sign.
 

@@ -5,17 +5,21 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
 from calib_planner.io import angle_factors, read_configurations
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic
 from calib_planner.units import quantity
+
+if TYPE_CHECKING:
+    from calib_planner.planning import Pace
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
 Group = argparse._ActionsContainer
@@ -207,6 +211,74 @@ def rows(option: str, given: Sequence[Sequence[float]], names: Sequence[str]) ->
     if not np.isfinite(array).all():
         raise InputError(option, "a number that is not finite", "finite numbers", "correct that number")
     return array
+
+
+# ── how long it takes ────────────────────────────────────────────────────────────────────────────────
+
+
+def add_pace(parser: argparse.ArgumentParser) -> None:
+    """How fast the robot moves, settles and is measured; see ``chosen_pace``."""
+    group = parser.add_argument_group("travel and time")
+    option(group, "--start", '"q1 … qn"', "where the robot stands before the first visit [rad | m]", kind=numbers)
+    speed = group.add_mutually_exclusive_group()
+    option(speed, "--speed", "V", "largest speed of every joint [rad/s | m/s]", kind=float)
+    text = "share of the speed limits in the URDF, 0 … 1 (0.25); 0.5 rad/s and 0.1 m/s without limits"
+    option(speed, "--speed-share", "F", text, kind=float)
+    text = "largest acceleration of every joint [rad/s² | m/s²] (twice the speed per second)"
+    option(group, "--acceleration", "A", text, kind=float)
+    option(
+        group, "--settle", "S", "time at rest before each measurement, until the arm is still [s] (2)", kind=float
+    )
+    option(group, "--dwell", "S", "time of each measurement, at rest [s] (3)", kind=float)
+
+
+def paced(args: argparse.Namespace) -> bool:
+    """Whether anything is said about ``add_pace``."""
+    names = ("start", "speed", "speed_share", "acceleration", "settle", "dwell")
+    return any(getattr(args, name) is not None for name in names)
+
+
+def chosen_pace(robot: Robot, args: argparse.Namespace) -> Pace:
+    """The pace of ``add_pace``'s arguments, of what is usual where nothing is said."""
+    from calib_planner.io import robot_pace  # with planning, 0.2 s, for commands that tell of time
+
+    usual = robot_pace(robot)
+    if args.speed_share is not None:
+        share = check_number("--speed-share", args.speed_share, low=0, low_open=True, high=1.0)
+        usual = robot_pace(robot, share=share)
+    pace, joints = usual, len(robot.joint_names)
+    if args.speed is not None:
+        speed = check_number("--speed", args.speed, low=0, low_open=True, high=100.0, unit="rad/s or m/s")
+        text = f"at most {speed:g} rad/s or m/s"
+        pace = replace(usual, speeds=np.full(joints, speed), accelerations=None, origin=text)
+    if args.acceleration is not None:
+        push = check_number("--acceleration", args.acceleration, low=0, low_open=True, high=1e4, unit="rad/s²")
+        pace = replace(pace, accelerations=np.full(joints, push))
+    for name in ("settle", "dwell"):
+        if getattr(args, name) is not None:
+            seconds = check_number(f"--{name}", getattr(args, name), low=0, high=86_400, unit="s")
+            pace = replace(pace, **{name: seconds})  # type: ignore[arg-type]
+    return pace
+
+
+def start_of(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
+    """(joints,) of --start [rad | m], or ``None``."""
+    return None if args.start is None else joint_rows("--start", [args.start], robot, args)[0]
+
+
+NUMBER = r"(\d+(?:\.\d*)?)"
+TIME = re.compile(rf"(?:{NUMBER}\s*h)?\s*(?:{NUMBER}\s*min)?\s*(?:{NUMBER}\s*s?)?")
+"""Hours, minutes and seconds, each with its unit; but see ``seconds``."""
+
+
+def seconds(text: str) -> float:
+    """A time: 2h, 90min, 7200s, 1h30; a number alone is in seconds, and one after hours is in minutes."""
+    word = re.sub(r"h\s*(\d+(?:\.\d*)?)$", r"h\1min", text.strip().lower())
+    match = TIME.fullmatch(word)
+    if match is None or not word:
+        raise argparse.ArgumentTypeError(f"expected a time such as 2h, 90min, 1h30 or 7200s, got {text!r}")
+    hours, minutes, rest = (float(part or 0) for part in match.groups())
+    return 3600.0 * hours + 60.0 * minutes + rest
 
 
 # ── what the instrument is and what may be measured at all ───────────────────────────────────────────

@@ -17,17 +17,22 @@ from calib_planner.cli.arguments import (
     Group,
     add_command,
     add_conditions,
+    add_pace,
     add_parameters,
     add_robot,
     add_seed,
     add_test_path,
     add_test_poses,
     choose_parameters,
+    chosen_pace,
     conditions,
     load_robot,
     numbers,
     option,
+    paced,
     require_test_poses,
+    seconds,
+    start_of,
     switch,
     test_poses,
 )
@@ -42,7 +47,6 @@ from calib_planner.io import (
     read_error_model,
     read_measurements,
     read_prior,
-    robot_pace,
     write_configurations,
     write_plan,
 )
@@ -57,21 +61,26 @@ from calib_planner.planning import (
     Progress,
     Search,
     Split,
+    Timetable,
     plan_for_accuracy,
+    plan_for_accuracy_in_time,
+    plan_for_time,
     plan_sheet,
     split_budget,
+    timetable,
     usual_error_model,
     with_wide_placement,
 )
 from calib_planner.planning import plan as find_plan
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
-from calib_planner.units import length
+from calib_planner.units import duration, length
 
 PAPER = "paper"
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
       --configurations 4 --repetitions 3 --output plan.yaml
-  calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --accuracy 0.02e-3"""
+  calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --accuracy 0.02e-3
+  calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --time-budget 30min --speed 0.2"""
 
 
 def add(commands: Commands, summary: str) -> None:
@@ -79,10 +88,20 @@ def add(commands: Commands, summary: str) -> None:
     work = add_problem(parser, any_criterion=True)
     size = work.add_mutually_exclusive_group(required=True)
     option(size, "--configurations", "M", "number of different configurations", kind=int)
+    text = (
+        "time for the measurements, e.g. 2h, 90min, 1h30 or seconds; the program chooses the configurations, how "
+    )
+    text += "often each is measured, and their order"
+    option(size, "--time-budget", "T", text, kind=seconds)
     text = "number of measurements in all; the program chooses the number of different configurations"
     option(size, "--measurements", "N", text, kind=int)
-    option(size, "--accuracy", "A", "take the fewest measurements that reach this ρ0 [m]", kind=float)
+    text = (
+        "reach this ρ0 [m] with the fewest measurements, or in the least time if one of the options about travel "
+    )
+    text += "and time is given"
+    option(size, "--accuracy", "A", text, kind=float)
     option(work, "--repetitions", "K", "number of measurements at each configuration (1)", kind=int)
+    add_pace(parser)
     switch(parser, "--prove", "make the bound rigorous, by branch and bound")
     option(parser, "--output", "FILE", "write the plan: .yaml, or .csv for a table")
     option(parser, "--sheet", "DIR", "write the sheet for the person at the robot, see sheet")
@@ -92,6 +111,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     _check(args)
     size = 1 if args.configurations is None else args.configurations
     problem = make_problem(args, size, 1 if args.repetitions is None else args.repetitions)
+    pace, start = chosen_pace(problem.robot, args), start_of(problem.robot, args)
     split: Split | None = None
     with terminal.progress("searching plans") as update:
 
@@ -101,7 +121,11 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         def watch(done: int, total: int) -> None:
             update(done / total, f"{done} sizes tried")
 
-        if args.accuracy is not None:
+        if args.time_budget is not None:
+            split = plan_for_time(problem, pace, args.time_budget, start, watch)
+        elif args.accuracy is not None and paced(args):
+            split = plan_for_accuracy_in_time(problem, args.accuracy, pace, start, watch)
+        elif args.accuracy is not None:
             split = plan_for_accuracy(problem, args.accuracy, watch=watch)
         elif args.measurements is not None:
             split = split_budget(problem, args.measurements, watch=watch)
@@ -112,13 +136,15 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         # 0.1 s for templates, which only a sheet waits for.
         from calib_planner.report import write_sheet
 
-        pace = robot_pace(problem.robot)
-        sheet = plan_sheet(plan, problem.robot, problem.constraints, problem.instrument, pace=pace)
+        sheet = plan_sheet(plan, problem.robot, problem.constraints, problem.instrument, pace=pace, start=start)
         tell_sheet(write_sheet(args.sheet, sheet, "--sheet"), terminal)
-    result = plan.to_dict() | (_tried(split) if split else {})
+    times = timetable(plan, problem.robot, pace, start)
+    result = plan.to_dict() | (_tried(split) if split else {}) | _times(times)
     result |= {"output": args.output} if args.output else {}
     result |= {"sheet": args.sheet} if args.sheet else {}
     terminal.answer(result, partial(show_plan, plan, problem.robot))
+    if not args.json:
+        terminal.answer({}, partial(show_times, times))
     if split and not args.json:
         terminal.answer({}, partial(show_tried, split))
     if args.output:
@@ -136,23 +162,35 @@ def _best(progress: Progress, criterion: str) -> str:
 
 
 def _tried(split: Split) -> dict[str, Any]:
-    """What was tried, for the JSON: configurations, repetitions, value [m] of each, and the proved minimum."""
-    rows = [
+    """What was tried, for the JSON: numbers, value [m] and time of each, and the proved minimum.
+
+    ``repetitions`` is one number where all configurations have the same, else a list.
+    """
+    rows: list[dict[str, Any]] = [
         {
             "configurations": len(p.configurations),
-            "repetitions": int(p.repetitions[0]),
+            "repetitions": int(p.repetitions[0]) if len(set(p.repetitions)) == 1 else p.repetitions.tolist(),
             "predicted_accuracy": p.quality.value,
         }
         for p in split.tried
     ]
+    for row, time in zip(rows, split.seconds, strict=False):
+        row["minutes"] = time / 60.0
     return {"tried": rows, "fewest_measurements": split.fewest or None}
+
+
+def _times(times: Timetable) -> dict[str, Any]:
+    """The clock of a plan, for the JSON: minutes in all, and seconds of every configuration."""
+    pace = times.pace
+    about = {"settle": pace.settle, "dwell": pace.dwell, "speeds_from": pace.origin}
+    return {"minutes": times.seconds / 60.0, **about, "stops": times.rows()}
 
 
 def _check(args: argparse.Namespace) -> None:
     if args.repetitions is not None and args.configurations is None:
         raise InputError("--repetitions", args.repetitions, "--configurations beside it")
     if args.prove and args.configurations is None:
-        raise InputError("--prove", "with --measurements or --accuracy", "--configurations beside it")
+        raise InputError("--prove", "without it", "--configurations beside it")
     if args.output and not args.output.lower().endswith((".yaml", ".yml", ".csv")):
         raise InputError("--output", repr(args.output), "a name that ends in .yaml or .csv")
     if args.sheet:
@@ -324,6 +362,15 @@ def show_plan(plan: Plan, robot: Robot, console: Console) -> None:
     )
 
 
+def show_times(times: Timetable, console: Console) -> None:
+    """Print how long a plan takes, and what the time goes to."""
+    rows = times.rows()
+    shares = {name: sum(row[name] for row in rows) for name in ("move", "back_off", "settle", "measure")}
+    words = {"move": "moving", "back_off": "coming back", "settle": "settling", "measure": "measuring"}
+    parts = ", ".join(f"{duration(time)} {words[name]}" for name, time in shares.items() if time)
+    console.print(f"About {duration(times.seconds)}: {parts}. Joint speeds {times.pace.origin}.")
+
+
 def _bound(plan: Plan) -> str:
     quality = plan.quality
     everywhere = f"Over all joint limits {length(quality.general_accuracy)} (rms)."
@@ -342,13 +389,17 @@ def _bound(plan: Plan) -> str:
 def show_tried(split: Split, console: Console) -> None:
     """Print the sizes that were tried for an accuracy or a budget."""
     table = Table(title="sizes tried")
-    for heading in ("configurations", "each", "measurements", "ρ0"):
+    for heading in ("configurations", "each", "measurements", "ρ0", *(("time",) if split.seconds else ())):
         table.add_column(heading, justify="right")
-    for p in split.tried:
-        k, r = len(p.configurations), int(p.repetitions[0])
-        table.add_row(
-            str(k), f"{r}×", str(p.measurements), length(p.quality.value), style="bold" if p is split.plan else ""
-        )
+    for i, p in enumerate(split.tried):
+        low, high = int(p.repetitions.min()), int(p.repetitions.max())
+        each = f"{low}×" if low == high else f"{low}–{high}×"
+        value = length(p.quality.value) if p.quality.criterion in POSE_CRITERIA else f"{p.quality.value:.5g}"
+        time = [duration(split.seconds[i])] if split.seconds else []
+        style = "bold" if p is split.plan else ""
+        table.add_row(str(len(p.configurations)), each, str(p.measurements), value, *time, style=style)
     console.print(table)
+    if split.seconds and split.plan.quality.value > min(p.quality.value for p in split.tried):
+        console.print("The best in what the search looks at: smaller and larger errors and other places, too.")
     if split.fewest:
         console.print(f"No plan of fewer than {split.fewest} measurements can reach it.")

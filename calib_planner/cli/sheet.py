@@ -9,21 +9,27 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib_planner.arrays import check_number, plain
-from calib_planner.cli.arguments import Commands, add_command, add_robot, joint_rows, load_robot, numbers, option
+from calib_planner.arrays import plain
+from calib_planner.cli.arguments import (
+    Commands,
+    add_command,
+    add_pace,
+    add_robot,
+    chosen_pace,
+    load_robot,
+    option,
+    start_of,
+)
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import FileFormatError
 from calib_planner.io import (
-    SHARE,
     SHEET_FILES,
     WORDS,
     read_constraints,
     read_instrument,
     read_plan,
-    robot_pace,
 )
-from calib_planner.planning import DWELL, Pace, PlanSheet, plan_sheet
-from calib_planner.robot import Robot
+from calib_planner.planning import PlanSheet, plan_sheet
 from calib_planner.units import duration, joint_unit, length, signed
 
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --configurations 6 \\
@@ -42,13 +48,7 @@ def add(commands: Commands, summary: str) -> None:
     known = parser.add_argument_group("what is to be checked")
     option(known, "--constraints", "FILE", "YAML: the plan's constraints, or others")
     option(known, "--instrument", "FILE", "YAML: where the tracker stands, if the constraints do not say")
-    time = parser.add_argument_group("travel and time")
-    option(time, "--start", '"q1 … qn"', "where the robot stands before the first visit [rad | m]", kind=numbers)
-    speed = time.add_mutually_exclusive_group()
-    option(speed, "--speed", "V", "largest speed of every joint [rad/s | m/s]", kind=float)
-    text = "share of the speed limits in the URDF, 0 … 1; 0.5 rad/s and 0.1 m/s without limits"
-    option(speed, "--speed-share", "F", text, SHARE)
-    option(time, "--dwell", "S", "time at standstill for each measurement [s]", DWELL)
+    add_pace(parser)
     option(parser, "--output", "DIR", f"folder for {', '.join(SHEET_FILES)}")
 
 
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         robot,
         () if args.constraints is None else read_constraints(args.constraints, robot),
         None if args.instrument is None else read_instrument(args.instrument),
-        pace=_pace(robot, args),
-        start=None if args.start is None else joint_rows("--start", [args.start], robot, args)[0],
+        pace=chosen_pace(robot, args),
+        start=start_of(robot, args),
     )
     written: list[str] = []
     if args.output:
@@ -83,15 +83,6 @@ def tell_sheet(written: list[str], terminal: Terminal) -> None:
     """Say so if the sheet came without its trajectory."""
     if len(written) < len(SHEET_FILES):
         terminal.note("No trajectory was written: not every configuration is reachable.")
-
-
-def _pace(robot: Robot, args: argparse.Namespace) -> Pace:
-    dwell = check_number("--dwell", args.dwell, low=0, high=86_400, unit="s")
-    if args.speed is not None:
-        speed = check_number("--speed", args.speed, low=0, low_open=True, high=100.0, unit="rad/s or m/s")
-        return Pace(np.full(len(robot.joint_names), speed), dwell, f"at most {speed:g} rad/s or m/s")
-    share = check_number("--speed-share", args.speed_share, low=0, low_open=True, high=1.0)
-    return robot_pace(robot, dwell, share)
 
 
 # ── a plan sheet for the terminal: what the plan promises, its visits, what was checked and what not ───────
@@ -131,14 +122,15 @@ def _visits(sheet: PlanSheet) -> Table:
     turns = sheet.robot.joint_is_revolute
     for name, turning in zip(sheet.plan.joint_names, turns, strict=True):
         table.add_column(f"{name}\n[{joint_unit(turning)}]", justify="right", overflow="fold")
-    for heading in ("times", "travel\nmax", "reach", "visible"):
+    for heading in ("times\nmin:s", "travel\nmax", "reach", "visible"):
         table.add_column(heading, justify="right", overflow="fold")
     visible = sheet.checks.visible
     for i, row in enumerate(sheet.degrees):
+        arrival = round(sheet.timetable.arrive[i])
         table.add_row(
             str(i + 1),
             *(signed(v, 3) for v in row),
-            f"{sheet.plan.repetitions[i]}×",
+            f"{sheet.plan.repetitions[i]}×\n{arrival // 60}:{arrival % 60:02d}",
             _travel(sheet, i),
             WORDS[bool(sheet.checks.reachable[i])],
             WORDS[None if visible is None else bool(visible[i])],

@@ -35,7 +35,7 @@ from calib_planner.io.text import write_text
 from calib_planner.io.urdf import read_speed_limits
 from calib_planner.io.xacro import split_arguments
 from calib_planner.io.yaml import Node, read_document, write_document
-from calib_planner.planning import DWELL, KEYS, KINDS, Pace, Plan, PlanSheet, usual_pace
+from calib_planner.planning import DWELL, KEYS, KINDS, SETTLE, Pace, Plan, PlanSheet, usual_pace
 from calib_planner.robot import Robot
 
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -100,18 +100,20 @@ NANO = 1_000_000_000
 WORDS = {True: "yes", False: "no", None: "not checked"}
 
 
-def robot_pace(robot: Robot, dwell: float = DWELL, share: float = SHARE) -> Pace:
+def robot_pace(robot: Robot, dwell: float = DWELL, share: float = SHARE, settle: float = SETTLE) -> Pace:
     """A share of the speed limits in the robot's URDF, or assumed speeds where there are none.
 
     Args:
-        dwell: Time at standstill for each measurement [s].
+        dwell: Time of each measurement, at rest [s].
+        settle: Time at rest before it [s].
     """
-    usual, path = usual_pace(robot, dwell), split_arguments(robot.source)[0]
+    usual, path = usual_pace(robot, dwell, settle), split_arguments(robot.source)[0]
     speeds = path.suffix.lower() in URDF_SUFFIXES
     limits = read_speed_limits(robot.source, robot.joint_names) if speeds else None
     if limits is None:
         return usual
-    return replace(usual, speeds=share * limits, origin=f"at most {share:.3g} of the URDF's speed limits")
+    origin = f"at most {share:.3g} of the URDF's speed limits"
+    return replace(usual, speeds=share * limits, accelerations=None, origin=origin)
 
 
 def write_sheet_yaml(path: str | Path, sheet: PlanSheet, field: str = "output") -> None:
@@ -144,7 +146,7 @@ def sheet_csv(sheet: PlanSheet) -> str:
 
 def _row(sheet: PlanSheet, i: int, visit: dict[str, Any]) -> dict[str, Any]:
     """Column name to value, in order; ``visit`` is the i-th of ``to_dict``."""
-    plan, sight, times = sheet.plan, sheet.checks.sight, sheet.timetable
+    plan, sight = sheet.plan, sheet.checks.sight
     turns = sheet.robot.joint_is_revolute
     row: dict[str, Any] = {"order": visit["order"], "configuration_index": visit["configuration_index"]}
 
@@ -174,8 +176,8 @@ def _row(sheet: PlanSheet, i: int, visit: dict[str, Any]) -> dict[str, Any]:
         put(f"azimuth{t + 1}_rad", sight.azimuths[i, t])
         put(f"elevation{t + 1}_rad", sight.elevations[i, t])
         put(f"incidence{t + 1}_rad", sight.incidences[i, t])
-    put("arrive_s", times.arrive[i])
-    put("leave_s", times.leave[i])
+    for name in ("move", "arrive", "settle", "measure", "back_off", "leave"):
+        put(f"{name}_s", visit[name])
     return row
 
 

@@ -4,7 +4,13 @@ docs/glossary.md explains the words.
 """
 
 from calib_planner.planning.bound import candidate_design
-from calib_planner.planning.budget import Split, plan_for_accuracy, split_budget
+from calib_planner.planning.budget import (
+    Split,
+    plan_for_accuracy,
+    plan_for_accuracy_in_time,
+    plan_for_time,
+    split_budget,
+)
 from calib_planner.planning.certify.prove import PROOF_STATUS
 from calib_planner.planning.constraints import (
     Custom,
@@ -24,7 +30,7 @@ from calib_planner.planning.information import (
     plan_space,
     smallest_size,
 )
-from calib_planner.planning.planner import Callback, Progress, plan
+from calib_planner.planning.planner import Callback, Progress, judged, plan
 from calib_planner.planning.problem import (
     GENERAL_SHARE,
     PAPERS_SHARE,
@@ -38,4 +44,16 @@ from calib_planner.planning.random_plans import Comparison, compare, random_accu
 from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.sheet import NEVER, PlanSheet, person_factors, plan_sheet
-from calib_planner.planning.tour import DWELL, PEAK, Pace, timetable, usual_pace, visiting_order
+from calib_planner.planning.tour import (
+    DWELL,
+    PEAK,
+    SETTLE,
+    Pace,
+    Timetable,
+    backed_off,
+    near,
+    timetable,
+    usual_pace,
+    visit_times,
+    visiting_order,
+)

@@ -73,7 +73,7 @@ class ExtendedModel:
     Attributes:
         robot: Its active parameters come first among the coefficients, then gravity and joint functions.
         model: How it errs.
-        repetitions: r, visits to each configuration.
+        repetitions: r, visits to each configuration; or (N,), for exactly the N configurations of a plan.
         configuration_sigma: σ_c, error of a configuration that repetition does not average away [m].
         basis: (joints, F, b) U_l.
         maps: (joints, F, p) how Φ_l enters the columns: U_l in its place, or less Θ_l.
@@ -83,7 +83,7 @@ class ExtendedModel:
 
     robot: Robot
     model: ErrorModel
-    repetitions: int
+    repetitions: int | IntArray
     configuration_sigma: float
     basis: FloatArray
     maps: FloatArray
@@ -145,12 +145,16 @@ class ExtendedModel:
         return np.sqrt(functions.variances(self.robot, self.model.values)[: 2 * functions.harmonics])
 
     @cached_property
-    def visit_variance(self) -> float:
-        """Variance of what each joint errs anew at each configuration, repeated as wanted [rad²]."""
+    def visit_variance(self) -> FloatArray:
+        """() or (N,) variance of what each joint errs anew at each configuration, repeated as wanted [rad²]."""
         visits = self.model.visits
-        if visits is None or not visits.joints:
-            return 0.0
-        return self.model.values["repeatability"] ** 2 / self.repetitions
+        there = visits is not None and visits.joints
+        return (self.model.values["repeatability"] ** 2 if there else 0.0) / np.asarray(self.repetitions, float)
+
+    @property
+    def times(self) -> FloatArray:
+        """(1, 1, 1) or (N, 1, 1) r."""
+        return np.reshape(self.repetitions, (-1, 1, 1)).astype(float)
 
     @cached_property
     def still(self) -> ErrorModel:
@@ -259,7 +263,7 @@ class LinearisedExtension:
     @cached_property
     def points(self) -> FloatArray:
         """(N, 3·targets, 3·targets) what is new at each visit and point, without the joints' part [m²]."""
-        r = self.model.still.visit_covariance(self.poses) / self.model.repetitions
+        r = self.model.still.visit_covariance(self.poses) / self.model.times
         return np.asarray(r + self.model.configuration_sigma**2 * np.eye(r.shape[-1]))
 
     def kernels(self, size: int, counts: FloatArray | None = None) -> FloatArray:
@@ -447,7 +451,7 @@ class LinearisedExtension:
         blocks = _diagonal(k, size, self.jacobian.shape[1])
         n, targets = len(blocks), len(self.model.robot.targets)
         own = blocks.reshape(n, targets, 3, targets, 3)[:, np.arange(targets), :, np.arange(targets), :]
-        scale = self.model.model.values.get("instrument", 1.0) ** 2 / self.model.repetitions
+        scale = self.model.model.values.get("instrument", 1.0) ** 2 / self.model.times[..., None, None]
         by_point = covariance_gradient(points.noise, self.poses.points) * scale
         push = -np.einsum("tnij,ntijx->ntx", own, by_point)
         by_joint += np.einsum("ntx,jtxn->nj", push, self.poses.linearisation.joint_columns)

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import FELT, accuracy_rows
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning.criteria import (
@@ -52,13 +52,13 @@ class InformationModel:
         robot: Its active parameters are the order of all matrices.
         noise: Covariance of one measured point.
         configuration_sigma: σ_c [m].
-        repetitions: r, measurements at each configuration.
+        repetitions: r, measurements at each configuration; or (N,), for exactly the N configurations of a plan.
     """
 
     robot: Robot
     noise: Noise
     configuration_sigma: float = 0.0
-    repetitions: int = 1
+    repetitions: int | IntArray = 1
 
     def at(self, q: FloatArray) -> FloatArray:
         """I(q) of each configuration: (N, joints) → (N, p, p)."""
@@ -80,7 +80,7 @@ class InformationModel:
         points, jacobian = self.robot.positions_and_jacobian(q)
         jacobian = np.ascontiguousarray(jacobian)
         if isinstance(self.noise, Isotropic):
-            return jacobian / np.sqrt(self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2)
+            return jacobian / np.sqrt(self.noise.sigma**2 / self._times(3) + self.configuration_sigma**2)
         whitener = np.linalg.inv(np.linalg.cholesky(self._covariance(points)))
         return (whitener @ jacobian.reshape(*points.shape, -1)).reshape(jacobian.shape)
 
@@ -94,14 +94,18 @@ class InformationModel:
     def _weigh(self, points: FloatArray, jacobian: FloatArray) -> FloatArray:
         """W J, (N, 3·targets, p)."""
         if isinstance(self.noise, Isotropic):
-            variance = self.noise.sigma**2 / self.repetitions + self.configuration_sigma**2
+            variance = self.noise.sigma**2 / self._times(3) + self.configuration_sigma**2
             return jacobian / variance
         blocks = jacobian.reshape(*points.shape, -1)
         return (np.linalg.inv(self._covariance(points)) @ blocks).reshape(jacobian.shape)
 
     def _covariance(self, points: FloatArray) -> FloatArray:
         common = self.configuration_sigma**2 * np.eye(3)
-        return self.noise.covariance(points) / self.repetitions + common
+        return self.noise.covariance(points) / self._times(points.ndim + 1) + common
+
+    def _times(self, axes: int) -> FloatArray:
+        """r with the configurations along the first of ``axes`` axes."""
+        return np.reshape(self.repetitions, (-1,) + (1,) * (axes - 1)).astype(float)
 
 
 Model = InformationModel | ExtendedModel
@@ -142,7 +146,7 @@ class LinearisedInformation:
             return gradient
         points = self.lin.points.transpose(2, 0, 1)
         blocks = pull.reshape(n, targets, 3, p) @ np.swapaxes(self.weighted.reshape(n, targets, 3, p), -1, -2)
-        by_point = covariance_gradient(noise, points) / self.model.repetitions
+        by_point = covariance_gradient(noise, points) / self.model._times(points.ndim + 2)
         force = -np.einsum("ntij,ntijx->ntx", blocks, by_point)
         return gradient + np.einsum("ntx,jtxn->nj", force, self.lin.joint_columns)
 
@@ -210,6 +214,11 @@ class PlanSpace:
     def nuisance(self) -> tuple[int, ...]:
         """Indices of the coefficients that are not of interest: of base, targets and the other terms."""
         return tuple(i for i in range(len(self.prior)) if i not in self.interest)
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements in a plan of the problem's size."""
+        return int(np.broadcast_to(self.model.repetitions, (self.problem.configurations,)).sum())
 
     def search_criterion(self) -> Criterion:
         """What the search maximises: the criterion wanted, with a share for accuracy elsewhere."""

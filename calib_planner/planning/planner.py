@@ -13,10 +13,11 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.error_model import FELT, Poses, covariance, error_variance
-from calib_planner.errors import InfeasibleError
+from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning.bound import (
     ApproximateDesign,
     DesignProblem,
@@ -110,6 +111,54 @@ def plan(
     return _assemble(space, target, design, proof, best, result, clock)
 
 
+@one_thread
+def judged(
+    problem: PlanProblem,
+    configurations: FloatArray,
+    repetitions: ArrayLike,
+    searched: Plan | None = None,
+    bounded: bool = True,
+) -> Plan:
+    """What given configurations promise, in their order, each with its own number of visits; no search.
+
+    Args:
+        problem: The request; its ``configurations`` and ``repetitions`` are not looked at.
+        configurations: (m, joints) [rad | m].
+        repetitions: One number, or (m,).
+        searched: The plan whose configurations these are: it says what the search took.
+        bounded: Whether a bound is wanted, which takes longer than the rest.
+
+    Raises:
+        InputError: Not a number of visits for each.
+        InfeasibleError: As for ``plan``.
+    """
+    space = space_of(problem, configurations, repetitions)
+    clock = _Clock(space.problem, len(space.interest), None)
+    rng = np.random.default_rng(problem.search.seed)
+    target = _criteria(space, rng)[1]
+    design, proof = None, None
+    if target.concave and bounded:
+        design = _approximate(space, target, rng, clock.over)
+        design, proof = _proven(space, target, design, rng, clock, False)
+    work = (0, 0) if searched is None else (searched.quality.starts, searched.quality.evaluations)
+    made = _assemble(space, target, design, proof, None, SearchResult(configurations, np.nan, *work), clock, True)
+    before = 0.0 if searched is None else searched.quality.seconds
+    return replace(made, quality=replace(made.quality, seconds=made.quality.seconds + before))
+
+
+def space_of(problem: PlanProblem, configurations: FloatArray, repetitions: ArrayLike) -> PlanSpace:
+    """The space of ``problem`` for exactly these configurations (m, joints), with r_i visits to each.
+
+    Raises:
+        InputError: Not a number of visits for each.
+    """
+    counts, size = np.asarray(repetitions), len(configurations)
+    if counts.shape not in ((), (size,)) or counts.dtype.kind not in "iu" or (counts < 1).any():
+        raise InputError("repetitions", counts.tolist(), f"a whole number >= 1, or {size} of them")
+    space = plan_space(replace(problem, configurations=size, repetitions=1))
+    return replace(space, model=replace(space.model, repetitions=counts))
+
+
 def value_of(problem: PlanProblem, configurations: FloatArray) -> float:
     """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
     space = plan_space(problem)
@@ -178,6 +227,12 @@ def _approximate(
 
 def _design_problem(space: PlanSpace, criterion: Criterion) -> DesignProblem:
     problem = space.problem
+    if np.ndim(space.model.repetitions):
+        # Unequal repetitions may be of any numbers, so that each measurement counts as a visit of its own.
+        visits = space.measurements
+        return DesignProblem(
+            space.single, criterion, space.prior, visits, space.feasibility, problem.candidate_array
+        )
     return DesignProblem(
         space.model,
         criterion,
@@ -342,10 +397,14 @@ def _assemble(
     best: _Bound | None,
     result: SearchResult,
     clock: _Clock,
+    given: bool = False,
 ) -> Plan:
+    """The plan; ``given``: its configurations stay as they are, in their order."""
     problem, robot = space.problem, space.robot
-    configurations = _rest_idle_joints(space, result.configurations)
-    configurations = configurations[visiting_order(configurations, robot)]
+    configurations = result.configurations
+    if not given:
+        configurations = _rest_idle_joints(space, configurations)
+        configurations = configurations[visiting_order(configurations, robot)]
     matrix = space.model.totals(configurations, len(configurations))[0] + space.prior
     inverse, hidden = covariance(matrix)
     squares = np.array([error_variance(rows, inverse, hidden) for rows in space.test_jacobians])
@@ -360,7 +419,7 @@ def _assemble(
     bound = best or _bound(space, target, design, proof, configurations)
     bound = _checked(bound.above(floor), psi)
     name = "compound" if problem.compound else problem.criterion
-    size, n = len(space.interest), problem.measurements
+    size, n = len(space.interest), space.measurements
     value = psi if problem.compound else reported_value(name, psi, size, n)
     value_bound = bound.psi if problem.compound or not bound.known else reported_value(name, bound.psi, size, n)
     general = float("inf") if hidden.size else float(np.trace(space.general @ inverse)) + space.general_floor
@@ -404,7 +463,7 @@ def _assemble(
         parameters=problem.robot.parameter_names,
         joint_names=robot.joint_names,
         configurations=configurations,
-        repetitions=np.full(len(configurations), problem.repetitions),
+        repetitions=np.broadcast_to(space.model.repetitions, (len(configurations),)),
         test_poses=problem.test_pose_array,
         weights=shares,
         sigma=problem.instrument.typical,
@@ -470,7 +529,8 @@ def _bound(
         text += f" Further starts of the maximisation raised the bound by less than {100 * missed:.1g} %."
     power = 0.5 if space.problem.criterion in POSE_CRITERIA and not space.problem.compound else 1.0
     rounded = float("nan")
-    if 0.0 < psi < UNEXPLAINED ** (1.0 / power) * design.bound:
+    equal = np.ndim(space.model.repetitions) == 0
+    if equal and 0.0 < psi < UNEXPLAINED ** (1.0 / power) * design.bound:
         rounded = (_rounded(space, target, design) / design.bound) ** power
     if np.isfinite(rounded):
         text += (

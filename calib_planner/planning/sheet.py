@@ -101,13 +101,15 @@ class PlanSheet:
             "checked": checks.checked,
             "not_checked": checks.unchecked,
             "station": checks.sight.station,
+            "minutes": times.seconds / 60.0,
             "seconds": times.seconds,
             "seconds_standing": times.standing,
+            "settle": times.pace.settle,
             "dwell": times.pace.dwell,
             "speeds_from": times.pace.origin,
             "reachable": bool(checks.reachable.all()),
             "visible": None if checks.visible is None else bool(checks.visible.all()),
-            "stops": [self._visit(i) for i in range(len(plan.configurations))],
+            "stops": [self._visit(i) | row for i, row in enumerate(times.rows())],
         }
 
     def _visit(self, i: int) -> dict[str, Any]:
@@ -131,8 +133,6 @@ class PlanSheet:
             "azimuths": checks.sight.azimuths[i],
             "elevations": checks.sight.elevations[i],
             "incidences": checks.sight.incidences[i],
-            "arrive": float(times.arrive[i]),
-            "leave": float(times.leave[i]),
         }
 
 

@@ -33,7 +33,7 @@ from calib_planner.planning import NEVER, POSE_CRITERIA, PlanSheet
 from calib_planner.report.render import TEMPLATES, Drawing, Shape, embedded, render, shape
 from calib_planner.report.scene import bodies
 from calib_planner.robot import Robot
-from calib_planner.units import duration, joint_factor, joint_unit, length, listed, signed
+from calib_planner.units import clock, duration, joint_factor, joint_unit, length, listed, signed
 
 BOXES = 12
 """More repetitions than this get one box with their number."""
@@ -106,6 +106,7 @@ def sheet_page(sheet: PlanSheet) -> str:
         most_boxes=BOXES,
         blanks=BLANKS,
         embedded=embedded,
+        repeated=sheet.plan.measurements > len(sheet.plan.configurations),
     )
 
 
@@ -165,6 +166,7 @@ def _row(sheet: PlanSheet, i: int, drawing: Drawing) -> dict[str, Any]:
         "breaks": sheet.checks.breaks[i],
         "aims": list(_aims(sheet, i)),
         "repetitions": int(plan.repetitions[i]),
+        "clock": (clock(sheet.timetable.arrive[i]), clock(sheet.timetable.leave[i])),
     }
 
 

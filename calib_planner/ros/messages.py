@@ -292,14 +292,19 @@ def estimate_from_message(message: CalibrationEstimate) -> ReceivedEstimate:
     return ReceivedEstimate(names, nominal, deviation, std, accuracy, sigma, float(message.sigma_estimate))
 
 
-def pace_of(robot: Robot, turning: float, sliding: float, limits: FloatArray, dwell: float) -> Pace:
+def pace_of(
+    robot: Robot, turning: float, sliding: float, limits: FloatArray, dwell: float, settle: float = 0.0
+) -> Pace:
     """Joint speeds: ``turning`` [rad/s] or ``sliding`` [m/s], and never above ``limits`` (joints,)."""
     wanted = np.where(robot.joint_is_revolute, turning, sliding)
-    return Pace(np.minimum(wanted, limits), dwell, "of the node's parameters and the robot description")
+    text = "of the node's parameters and the robot description"
+    return Pace(np.minimum(wanted, limits), dwell, text, settle)
 
 
 def trajectory_message(plan: Plan, robot: Robot, pace: Pace, stamp: int, frame_id: str) -> JointTrajectory:
-    """A plan for a controller: at every visit a point of arrival and one of departure, both at rest.
+    """A plan for a controller: at every visit a point of arrival and one of departure, at rest as all points.
+
+    Before a further visit to the same configuration there is a point aside.
 
     Args:
         plan: Its configurations [rad | m], in the order of visiting.

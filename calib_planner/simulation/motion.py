@@ -18,10 +18,7 @@ from numpy.typing import ArrayLike
 
 from calib_planner.acquisition import NANO
 from calib_planner.arrays import FloatArray, IntArray, frozen
-from calib_planner.planning import PEAK
-
-BACK_OFF = 0.05
-"""How far the robot backs off between two standstills at nearly the same place [rad | m]."""
+from calib_planner.planning import PEAK, backed_off, near
 
 
 def smooth(tau: ArrayLike) -> FloatArray:
@@ -130,18 +127,12 @@ def make_tour(
 
     for index, (goal, count) in enumerate(zip(configurations, repetitions, strict=True)):
         for _ in range(int(count)):
-            if np.max(np.abs(goal - here)) < BACK_OFF:
+            if near(goal - here):
                 go(backed_off(goal, limits), index)
             go(goal, index)
             phases.append(Phase(now, now + dwell, here, here, index, True))
             now += dwell
     return Tour(tuple(phases))
-
-
-def backed_off(q: FloatArray, limits: FloatArray) -> FloatArray:
-    """``q`` (n,) moved by ``BACK_OFF`` towards the middle of the limits."""
-    middle = limits.mean(axis=1)
-    return q + BACK_OFF * np.where(q <= middle, 1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)

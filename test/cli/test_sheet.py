@@ -52,7 +52,7 @@ def test_all_files_and_the_json_of_a_shipped_robot(plan_file, tmp_path, capsys):
     q, repetitions = read_plan_csv(folder / "plan_sheet.csv", Robot.load("kuka_kr270"))
     np.testing.assert_array_equal(q, plan.configurations)
     np.testing.assert_array_equal(repetitions, 2)
-    assert len(yaml.safe_load((folder / "trajectory.yaml").read_text())["points"]) == 8
+    assert len(yaml.safe_load((folder / "trajectory.yaml").read_text())["points"]) == 4 * 5
     assert found["id"] in (folder / "plan_sheet.html").read_text()
     status, out, _ = call(capsys, "simulate", "--robot", "kuka_kr270", "--plan", str(folder / "plan_sheet.csv"))
     assert status == 0 and len(out.splitlines()) == 1 + 8
@@ -98,15 +98,17 @@ def test_speeds_are_the_urdf_s_or_as_asked_for(tmp_path, capsys):
     write_plan(path, plan_of(mixed(), np.array([[0.1, 0.2, 0.3, 0.4], [0.2, 0.2, 0.3, 0.4]])))
     base = ("sheet", "--plan", str(path), "--robot", str(urdf), "--json")
     for options, speeds, seconds in (
-        ((), [0.25, 0.25, 1.0, 0.25], 1.0),
+        ((), [0.25, 0.25, 1.0, 0.25], np.sqrt(10 / np.sqrt(3) * 0.1 / 0.5)),
+        (("--acceleration", "9"), [0.25, 0.25, 1.0, 0.25], 1.0),
         (("--speed-share", "0.05"), [0.05, 0.05, 0.2, 0.05], 1.875 * 0.1 / 0.05),
-        (("--speed", "0.01", "--dwell", "0"), [0.01] * 4, 1.875 * 0.1 / 0.01),
+        (("--speed", "0.01", "--dwell", "0", "--settle", "0"), [0.01] * 4, 1.875 * 0.1 / 0.01),
     ):
         status, out, _ = call(capsys, *base, *options)
         found = json.loads(out)
         assert status == 0 and [j["speed"] for j in found["joints"]] == pytest.approx(speeds)
         assert found["stops"][1]["arrive"] - found["stops"][0]["leave"] == pytest.approx(seconds)
         assert [j["unit"] for j in found["joints"]] == ["rad", "m", "rad", "rad"]
+        assert found["minutes"] == found["stops"][-1]["leave"] / 60
 
 
 def test_a_plan_of_another_robot_says_so(tmp_path, capsys):

@@ -13,7 +13,7 @@ from calib_planner import Robot
 from calib_planner.errors import InfeasibleError
 from calib_planner.io import write_trajectory
 from calib_planner.io.plan import NANO, trajectory_text
-from calib_planner.planning import Pace, plan_sheet
+from calib_planner.planning import Pace, backed_off, plan_sheet
 
 POINT = ["positions", "velocities", "accelerations", "effort", "time_from_start"]
 
@@ -23,7 +23,7 @@ POINT = ["positions", "velocities", "accelerations", "effort", "time_from_start"
 def test_points_are_the_stops(make, dwell, tmp_path: Path) -> None:
     robot = make()
     q = random_configurations(robot, 5, 3)
-    sheet = plan_sheet(plan_of(robot, q, 2), robot, pace=Pace(np.full(q.shape[1], 0.3), dwell))
+    sheet = plan_sheet(plan_of(robot, q, 2), robot, pace=Pace(np.full(q.shape[1], 0.3), dwell, settle=0.0))
     path = tmp_path / "trajectory.yaml"
     write_trajectory(path, sheet)
     read = yaml.safe_load(path.read_text())
@@ -32,13 +32,16 @@ def test_points_are_the_stops(make, dwell, tmp_path: Path) -> None:
     each = 2 if dwell else 1
     assert all(list(p) == POINT for p in read["points"])
     positions = np.array([p["positions"] for p in read["points"]])
-    assert positions.tobytes() == np.repeat(q, each, axis=0).tobytes()
+    between = backed_off(q, robot.joint_limits)
+    expected = [row for a, b in zip(q, between, strict=True) for row in (*[a] * each, b, *[a] * each)]
+    assert positions.tobytes() == np.array(expected).tobytes()
     assert all(p["velocities"] == [0.0] * q.shape[1] for p in read["points"])
     after = [p["time_from_start"]["sec"] * NANO + p["time_from_start"]["nanosec"] for p in read["points"]]
     assert all(0 <= p["time_from_start"]["nanosec"] < NANO for p in read["points"])
     assert (np.diff(after) > 0).all()
-    wanted = np.stack([sheet.timetable.arrive, sheet.timetable.leave], axis=1)[:, :each].ravel()
-    np.testing.assert_allclose(np.array(after) / NANO, wanted, rtol=0, atol=1e-9)
+    shown = np.array(after).reshape(5, -1)[:, [0, -1]] / NANO
+    wanted = np.stack([sheet.timetable.arrive, sheet.timetable.leave], axis=1)
+    np.testing.assert_allclose(shown, wanted, rtol=0, atol=1e-9)
 
 
 def test_no_trajectory_leads_beyond_a_joint_limit(tmp_path: Path) -> None:

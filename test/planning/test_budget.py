@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from robots import random_configurations
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, plan
-from calib_planner.error_model import Prior
+from calib_planner.error_model import Prior, typical
 from calib_planner.planning import (
+    Pace,
     Search,
     compare,
+    judged,
     plan_for_accuracy,
+    plan_for_accuracy_in_time,
+    plan_for_time,
     plan_space,
     random_accuracies,
     split_budget,
+    visit_times,
 )
+from calib_planner.planning.budget import _Tour
 from calib_planner.planning.planner import value_of
+from calib_planner.tracker import Isotropic
 
 POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 
@@ -141,3 +152,94 @@ def test_prior_and_measured_replace_measurements(planned):
 def test_next_plan_needs_a_prior_for_what_it_cannot_identify_alone():
     with pytest.raises(InfeasibleError, match="at least 3"):
         plan(problem(configurations=1))
+
+
+# ── time ─────────────────────────────────────────────────────────────────────────────────────────────
+
+SLOW = Pace(np.full(6, 0.2))
+WHOLE = replace(typical(Isotropic(3e-5)), name="taught")
+
+
+def test_a_time_is_kept_and_nearly_used_up():
+    request = problem(search=Search(starts=2))
+    before = np.inf
+    for seconds in (120.0, 200.0):
+        split = plan_for_time(request, SLOW, seconds)
+        times, plan = split.timetable, split.plan
+        again = visit_times(request.robot, plan.configurations, plan.repetitions, SLOW)
+        assert times.seconds == again.seconds <= seconds
+        assert seconds - times.seconds < 2 * SLOW.standstill + 4  # no further visit fits
+        assert plan.quality.lower_bound <= plan.quality.value < before
+        assert plan.measurements > len(plan.configurations)  # coming back costs less than moving on
+        assert max(split.seconds) <= seconds and split.seconds[split.tried.index(plan)] == times.seconds
+        before = plan.quality.value
+
+
+def test_visits_go_where_they_tell_most():
+    """Any single visit that is taken elsewhere makes the criterion worse, or hardly better."""
+    request = problem(search=Search(starts=2, general_weight=0.0))
+    q = plan(replace(request, configurations=7)).configurations
+    tour = _Tour((plan_space(replace(request, configurations=7)),), q, SLOW, None)
+    counts = tour.filled(tour.seconds(tour.once) + 400.0)
+    assert counts.sum() > 30
+    best = tour.log_value(counts)
+    for i, j in itertools.permutations(range(7), 2):
+        if counts[i] > 1:
+            moved = counts.copy()
+            moved[i] -= 1
+            moved[j] += 1
+            assert tour.log_value(moved) < best + 2e-3
+
+
+@pytest.mark.parametrize("model", [None, WHOLE], ids=["paper", "whole"])
+def test_the_gain_of_a_visit_is_that_of_the_criterion(model):
+    """The slope by central differences; of ΔM = R/r − R/(r+1) to first order it is the gain times (r+1)/r."""
+    request = problem(configurations=5, error_model=model, search=Search(starts=2, general_weight=0.0))
+    space, q = plan_space(request), random_configurations(request.robot, 5, 2) / 2
+    tour, counts = _Tour((space,), q, SLOW, None), np.array([20, 30, 25, 15, 18])
+    gains = tour._gains(counts) * (1.0 if model is None else (counts + 1) / counts)
+    for i in range(5):
+        one = (np.arange(5) == i).astype(int)
+        slope = (tour.log_value(counts + one) - tour.log_value(counts - one)) / 2
+        assert gains[i] == pytest.approx(slope, rel=3e-2)
+
+
+def test_unequal_visits_promise_what_their_rows_promise():
+    """r_i visits to a configuration are r_i rows of it: value, bound and accuracy elsewhere."""
+    request = problem(search=Search(starts=2))
+    q, counts = plan(request).configurations, np.array([3, 1, 4, 2])
+    told = judged(request, q, counts)
+    rows = judged(request, np.repeat(q, counts, axis=0), 1)
+    for name in ("value", "lower_bound", "general_accuracy"):
+        assert getattr(told.quality, name) == pytest.approx(getattr(rows.quality, name), rel=1e-6), name
+    np.testing.assert_array_equal(told.repetitions, counts)
+    np.testing.assert_array_equal(told.configurations, q)
+    for wrong in ([1, 2], [1, 2, 3, 0], [1.0, 2.0, 3.0, 4.0]):
+        with pytest.raises(InputError, match="repetitions"):
+            judged(request, q, wrong)
+
+
+def test_the_least_time_for_an_accuracy_is_found_again_by_that_time():
+    request = problem(search=Search(starts=2))
+    split = plan_for_accuracy_in_time(request, 1.5e-5, SLOW)
+    assert split.plan.quality.value <= 1.5e-5
+    assert split.timetable.seconds == min(split.seconds)
+    assert plan_for_time(request, SLOW, split.timetable.seconds).plan.quality.value < 1.5e-5 * 1.02
+    with pytest.raises(InfeasibleError, match="not reached"):
+        plan_for_accuracy_in_time(two_link(), 1e-9, Pace([1.0, 1.0]))
+
+
+def test_with_errors_of_its_own_a_configuration_is_not_repeated():
+    """σ_c as large as the noise: going on tells more than coming back, wherever the robot is quick."""
+    request = problem(search=Search(starts=2), configuration_sigma=1e-4)
+    split = plan_for_time(request, Pace(np.full(6, 3.0)), 80.0)
+    assert split.plan.measurements - len(split.plan.configurations) <= 2
+
+
+def test_a_time_that_is_too_short_says_what_is_needed():
+    with pytest.raises(InfeasibleError, match="3 configurations are needed, which take about"):
+        plan_for_time(problem(search=Search(starts=2)), SLOW, 20.0)
+    with pytest.raises(InputError, match="compound"):
+        plan_for_time(problem(compound={"d": 0.3}), SLOW, 200.0)
+    with pytest.raises(InputError, match="time_budget"):
+        plan_for_time(problem(), SLOW, -1.0)

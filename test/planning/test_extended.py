@@ -79,6 +79,7 @@ def test_the_gradient_is_that_of_the_information(case: tuple[Robot, ErrorModel])
     draw = np.random.default_rng(0).standard_normal((2, model.size, model.size))
     weights = draw @ np.swapaxes(draw, 1, 2)
     seen = model.linearised(q[:4]).seen_from(np.array([1.0, 2.0, 1.0, 0.5]))[0].model
+    seen = replace(seen, repetitions=np.arange(1, 9))
     for asked, size in ((model, 4), (seen, 1)):
         each = np.repeat(weights, 4 // size, axis=0)
         got, step, expected = asked.linearised(q).gradient(each), 1e-6, np.zeros(q.shape)
@@ -136,6 +137,15 @@ def test_the_compiled_coupling_is_numpys(shape: tuple[int, int, int, int]) -> No
             extended._kernel.couple(*wrong)
     with pytest.raises(ValueError, match="fit"):
         extended._kernel.couple_back(levers, kernels, changes, whole, *got[::-1])
+
+
+def test_visits_may_be_of_unequal_number(case: tuple[Robot, ErrorModel]) -> None:
+    """r_i visits tell as much as r_i rows of the same configuration; σ_c alone is not averaged."""
+    model, q = of(*case)
+    model, counts = replace(model, configuration_sigma=0.0), np.array([3, 1, 2, 5, 1])
+    unequal = replace(model, repetitions=counts).totals(q[:5], 5)
+    rows = replace(model, repetitions=1).totals(np.repeat(q[:5], counts, axis=0), 12)
+    np.testing.assert_allclose(unequal, rows, rtol=0, atol=1e-7 * np.abs(rows).max())
 
 
 def test_what_is_eliminated_is_the_schur_complement(case: tuple[Robot, ErrorModel]) -> None:

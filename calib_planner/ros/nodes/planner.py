@@ -165,7 +165,8 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         assert result.plan is not None and result.model is not None
         made, robot, settings = result.plan, result.model.robot, self.settings.value
         _, trajectories, pictures = self._publishers_of
-        pace = pace_of(robot, settings.joint_speed, settings.slide_speed, result.model.speeds, settings.dwell)
+        speeds = (settings.joint_speed, settings.slide_speed, result.model.speeds)
+        pace = pace_of(robot, *speeds, settings.dwell, settings.settle)
         try:
             trajectories.publish(trajectory_message(made, robot, pace, stamp, settings.frame_id))
         except CalibPlannerError as error:
