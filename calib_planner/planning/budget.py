@@ -33,10 +33,10 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray, check_count, check_number
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.planning.criteria import POSE_CRITERIA, ridged
+from calib_planner.planning.criteria import POSE_CRITERIA, Criterion, reported_value, ridged
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space, smallest_size, spread_spaces
-from calib_planner.planning.planner import judged, plan, value_of
+from calib_planner.planning.planner import judged, plan, psi_of, value_of
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import Plan
 from calib_planner.planning.tour import Pace, Timetable, visit_times, visiting_order
@@ -335,17 +335,18 @@ class _Tour:
 
     def log_value(self, counts: IntArray) -> float:
         """log Ψ of what the search maximises, the mean over ``spaces``."""
-        values = [np.log(max(s.search_criterion().exact(self._matrix(s, counts)), 1e-300)) for s in self.spaces]
-        return float(np.mean(values))
+        values = [self._psi(space, space.search_criterion(), counts) for space in self.spaces]
+        return float(np.mean(np.log(np.maximum(values, 1e-300))))
 
     def _accuracy(self, counts: IntArray) -> float:
         space = self.spaces[0]
-        return float(space.criterion(space.problem.criterion).exact(self._matrix(space, counts)) ** -0.5)
+        psi = self._psi(space, space.criterion(space.problem.criterion), counts)
+        return reported_value(space.problem.criterion, psi, len(space.interest), int(counts.sum()))
 
-    def _matrix(self, space: PlanSpace, counts: IntArray) -> FloatArray:
-        model = replace(space.model, repetitions=counts)
-        total = model.totals(self.configurations, len(counts)) + space.prior
-        return np.asarray(ridged(total)[0])
+    def _psi(self, space: PlanSpace, criterion: Criterion, counts: IntArray) -> float:
+        """Ψ as ``plan`` reports it."""
+        visited = replace(space, model=replace(space.model, repetitions=counts))
+        return psi_of(visited, criterion, self.configurations)
 
     def _given_away(self, counts: IntArray, extra: int) -> IntArray:
         """``extra`` visits more, each where it tells most."""

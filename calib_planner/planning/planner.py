@@ -162,7 +162,7 @@ def space_of(problem: PlanProblem, configurations: FloatArray, repetitions: Arra
 def value_of(problem: PlanProblem, configurations: FloatArray) -> float:
     """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
     space = plan_space(problem)
-    psi = _psi_of(space, space.criterion(problem.criterion), configurations)
+    psi = psi_of(space, space.criterion(problem.criterion), configurations)
     return reported_value(problem.criterion, psi, len(space.interest), problem.measurements)
 
 
@@ -307,7 +307,7 @@ def _search(
         if best is None or result.log_value > best.log_value:
             best = result
         # With other sizes of the errors beside them, ``log_value`` is a mean over all of them.
-        psi = _psi_of(space, criterion, best.configurations) if search.beside else np.exp(best.log_value)
+        psi = psi_of(space, criterion, best.configurations) if search.beside else np.exp(best.log_value)
         clock.tell(done, float(np.log(max(psi, 1e-300))))
     for future in futures:
         future.cancel()
@@ -325,7 +325,7 @@ def _good_enough(space: PlanSpace, design: ApproximateDesign | None, best: Searc
     """Whether the best plan is so near its bound that more starts cannot pay."""
     if design is None or best is None or space.problem.compound:
         return False
-    psi = _psi_of(space, space.criterion(space.problem.criterion), best.configurations)
+    psi = psi_of(space, space.criterion(space.problem.criterion), best.configurations)
     return psi >= (1.0 - GOOD_ENOUGH) * design.bound
 
 
@@ -355,7 +355,7 @@ def _choose(
         clock.tell(problem.starts, chosen.log_value)
         return SearchResult(allowed[chosen.rows], chosen.log_value, chosen.starts, chosen.evaluations), None
     clock.tell(problem.starts, every.log_value)
-    psi = _psi_of(space, target, allowed[every.top_rows])
+    psi = psi_of(space, target, allowed[every.top_rows])
     text = f" The bound is proven: each of the {every.choices} choices there are was evaluated."
     if not one:
         sizes = " and over several sizes of the robot's errors" if request.beside else ""
@@ -415,7 +415,7 @@ def _assemble(
     plain = problem.criterion == "test_pose" and not problem.compound
     # For the paper's criterion Ψ is that of the figure reported, to the last digit.
     floor = float(shares @ space.test_floor) if plain else 0.0
-    psi = accuracy**-2 if plain else _psi_of(space, target, configurations)
+    psi = accuracy**-2 if plain else psi_of(space, target, configurations)
     bound = best or _bound(space, target, design, proof, configurations)
     bound = _checked(bound.above(floor), psi)
     name = "compound" if problem.compound else problem.criterion
@@ -516,7 +516,7 @@ def _bound(
     """The bound on Ψ of the design, raised where the plan shows that its maximisation had missed something."""
     if design is None:
         return _Bound()
-    psi, text = _psi_of(space, target, configurations), ""
+    psi, text = psi_of(space, target, configurations), ""
     proven = proof is not None and proof.holds
     if psi > (1.0 + ROUNDING) * design.bound and not proven:
         rng = np.random.default_rng(space.problem.search.seed)
@@ -550,7 +550,7 @@ def _rounded(space: PlanSpace, target: Criterion, design: ApproximateDesign) -> 
         )
     except InfeasibleError:  # some of its weight is on the spread that keeps it regular
         return float("nan")
-    return _psi_of(space, target, design.support[chosen.rows])
+    return psi_of(space, target, design.support[chosen.rows])
 
 
 def _terms(space: PlanSpace, inverse: FloatArray) -> tuple[PlannedTerm, ...]:
@@ -608,7 +608,7 @@ def _efficiency(name: str, psi: float, bound: float, value: float, value_bound: 
     return psi / bound if bound > 0 else 0.0
 
 
-def _psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
+def psi_of(space: PlanSpace, criterion: Criterion, configurations: FloatArray) -> float:
     """Ψ of a plan; 0 where it is blind to what the criterion needs."""
     matrix = space.model.totals(configurations, len(configurations))[0] + space.prior
     return _psi_of_matrix(space, criterion, matrix)

@@ -14,6 +14,7 @@ from calib_planner.error_model import Prior, typical
 from calib_planner.planning import (
     Pace,
     Search,
+    budget,
     compare,
     judged,
     plan_for_accuracy,
@@ -163,7 +164,7 @@ WHOLE = replace(typical(Isotropic(3e-5)), name="taught")
 def test_a_time_is_kept_and_nearly_used_up():
     request = problem(search=Search(starts=2))
     before = np.inf
-    for seconds in (120.0, 200.0):
+    for seconds in (100.0, 140.0):
         split = plan_for_time(request, SLOW, seconds)
         times, plan = split.timetable, split.plan
         again = visit_times(request.robot, plan.configurations, plan.repetitions, SLOW)
@@ -194,14 +195,14 @@ def test_visits_go_where_they_tell_most():
 @pytest.mark.parametrize("model", [None, WHOLE], ids=["paper", "whole"])
 def test_the_gain_of_a_visit_is_that_of_the_criterion(model):
     """The slope by central differences; of ΔM = R/r − R/(r+1) to first order it is the gain times (r+1)/r."""
-    request = problem(configurations=5, error_model=model, search=Search(starts=2, general_weight=0.0))
-    space, q = plan_space(request), random_configurations(request.robot, 5, 2) / 2
-    tour, counts = _Tour((space,), q, SLOW, None), np.array([20, 30, 25, 15, 18])
+    request = problem(configurations=9, error_model=model, search=Search(starts=2, general_weight=0.0))
+    space, q = plan_space(request), random_configurations(request.robot, 9, 2)
+    tour, counts = _Tour((space,), q, SLOW, None), np.array([20, 30, 25, 15, 18, 22, 40, 12, 10])
     gains = tour._gains(counts) * (1.0 if model is None else (counts + 1) / counts)
-    for i in range(5):
-        one = (np.arange(5) == i).astype(int)
+    for i in range(9):
+        one = (np.arange(9) == i).astype(int)
         slope = (tour.log_value(counts + one) - tour.log_value(counts - one)) / 2
-        assert gains[i] == pytest.approx(slope, rel=3e-2)
+        assert gains[i] == pytest.approx(slope, rel=1e-2)
 
 
 def test_unequal_visits_promise_what_their_rows_promise():
@@ -219,12 +220,13 @@ def test_unequal_visits_promise_what_their_rows_promise():
             judged(request, q, wrong)
 
 
-def test_the_least_time_for_an_accuracy_is_found_again_by_that_time():
+def test_the_least_time_for_an_accuracy_is_found_again_by_that_time(monkeypatch):
     request = problem(search=Search(starts=2))
-    split = plan_for_accuracy_in_time(request, 1.5e-5, SLOW)
-    assert split.plan.quality.value <= 1.5e-5
+    split = plan_for_accuracy_in_time(request, 2e-5, SLOW)
+    assert split.plan.quality.value <= 2e-5
     assert split.timetable.seconds == min(split.seconds)
-    assert plan_for_time(request, SLOW, split.timetable.seconds).plan.quality.value < 1.5e-5 * 1.02
+    assert plan_for_time(request, SLOW, split.timetable.seconds).plan.quality.value < 2e-5 * 1.02
+    monkeypatch.setattr(budget, "MOST_CONFIGURATIONS", 3)
     with pytest.raises(InfeasibleError, match="not reached"):
         plan_for_accuracy_in_time(two_link(), 1e-9, Pace([1.0, 1.0]))
 
