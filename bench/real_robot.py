@@ -1,12 +1,13 @@
 """Plans on a measured UR10 against random choices of the same rows, same estimator, same held-out data.
 
-    python bench/real_robot.py [--data ../shared/data] [--seeds 6] [--pool 600] [--random 100] [--json FILE]
+    python bench/real_robot.py [--data ../shared/data] [--seeds 6] [--pool 600] [--random 100] [--others]
+        [--json FILE]
 
 For every seed a random part of ``ur10_tracker/random_poses.csv`` is the pool; n of its rows are chosen, all
 placement errors with tracker and target are identified from them by the default estimator, with all
 terms, and all other rows of the file are predicted. "Beats" is the share of random choices from the same pool
 with a larger mean (95th percentile) error. Measured points enter the choice only through the rough pose of
-tracker and target (every fifth row of the file).
+tracker and target (every fifth row of the file). ``--others`` compares plans that know less beside the default.
 """
 
 from __future__ import annotations
@@ -50,12 +51,12 @@ class Estimator:
         """Mean and 95th percentile of the error at all other rows [mm]."""
         others = np.setdiff1d(np.arange(len(self.data)), rows)
         known = identify(IdentificationProblem(self.robot, self.data.select(rows))).knowledge
-        difference: FloatArray = self.data.p[others] - known.predict(self.data.q[others]).mean
+        difference: FloatArray = self.data.p[others] - known.poses(self.data.q[others]).points
         distance = 1e3 * np.linalg.norm(difference[:, 0], axis=1)
         return float(np.mean(np.asarray(distance, float))), float(np.percentile(distance, 95))
 
 
-def planners(robot: Robot) -> dict[str, Callable[[FloatArray, int], FloatArray]]:
+def planners(robot: Robot, others: bool) -> dict[str, Callable[[FloatArray, int], FloatArray]]:
     """Name → (pool, n) → configurations."""
 
     def ask(**options: Any) -> Callable[[FloatArray, int], FloatArray]:
@@ -68,26 +69,29 @@ def planners(robot: Robot) -> dict[str, Callable[[FloatArray, int], FloatArray]]
 
     usual = usual_error_model(robot, SIGMA)
     white = replace(ErrorModel.paper(Isotropic(3e-4)), placement=usual.placement, scales=usual.scales)
-    return {
-        "typical": ask(error_model=usual),
-        "white 0.3 mm, priors": ask(error_model=white),
-        "plain test poses": ask(),
-        "plain D": ask(criterion="d"),
-    }
+    default = {"typical": ask(error_model=usual)}
+    return (
+        default
+        if not others
+        else default
+        | {
+            "white 0.3 mm, priors": ask(error_model=white),
+            "plain test poses": ask(),
+            "plain D": ask(criterion="d"),
+        }
+    )
 
 
 def one_seed(
     seed: int, data: Measurements, judges: dict[str, Estimator], ways: dict[str, Any], size: int, count: int
 ) -> list[dict[str, Any]]:
     """Every planner and estimator at every n on one pool."""
-    rng = np.random.default_rng(seed)
-    pool = rng.choice(len(data), size, replace=False)
+    pool = pool_of(seed, len(data), size)
     result = []
     for n in COUNTS:
         chosen = {name: _rows(data.q, pool, way(data.q[pool], n)) for name, way in ways.items()}
-        draws = [rng.choice(pool, n, replace=False) for _ in range(count)]
         for judge, estimator in judges.items():
-            random = np.array([estimator.held_out(rows) for rows in draws])
+            random = random_choices(estimator, seed, pool, n, count)
             for name, rows in chosen.items():
                 got = np.array(estimator.held_out(rows))
                 beats = 100.0 * (random > got).mean(axis=0)
@@ -96,6 +100,17 @@ def one_seed(
                 entry |= {"random_mean_mm": np.median(random[:, 0]), "random_p95_mm": np.median(random[:, 1])}
                 result.append({k: v if isinstance(v, (str, int)) else float(v) for k, v in entry.items()})
     return result
+
+
+def pool_of(seed: int, rows: int, size: int) -> IntArray:
+    """(size,) rows that may be chosen."""
+    return np.random.default_rng([seed, 0]).choice(rows, size, replace=False)
+
+
+def random_choices(estimator: Estimator, seed: int, pool: IntArray, n: int, count: int) -> FloatArray:
+    """(count, 2) mean and 95th percentile [mm] of random choices, which no planner has a say in."""
+    rng = np.random.default_rng([seed, n])
+    return np.array([estimator.held_out(rng.choice(pool, n, replace=False)) for _ in range(count)])
 
 
 def _rows(q: FloatArray, pool: IntArray, configurations: FloatArray) -> IntArray:
@@ -132,6 +147,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--pool", type=int, default=600)
     parser.add_argument("--random", type=int, default=100)
+    parser.add_argument("--others", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     folder = args.data / "ur10_tracker"
@@ -141,7 +157,7 @@ def main() -> None:
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
     data = read_measurements(folder / "random_poses.csv", robot).data
     robot = start_robot(robot, data.select(np.arange(0, len(data), 5)))
-    judges, ways = {"default": Estimator(robot, data)}, planners(robot)
+    judges, ways = {"default": Estimator(robot, data)}, planners(robot, args.others)
     entries = []
     for seed in range(args.seeds):
         entries += one_seed(seed, data, judges, ways, args.pool, args.random)
