@@ -26,7 +26,13 @@ from calib_planner.planning.bound import (
     raised,
 )
 from calib_planner.planning.certify.prove import USUAL_WORK, Proof, prove_bound
-from calib_planner.planning.criteria import POSE_CRITERIA, Compound, Criterion, reported_value
+from calib_planner.planning.criteria import (
+    POSE_CRITERIA,
+    Compound,
+    Criterion,
+    is_sharp,
+    reported_value,
+)
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space, spread_spaces
 from calib_planner.planning.problem import PlanProblem
@@ -34,6 +40,7 @@ from calib_planner.planning.result import STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.enumeration import best_of_all
 from calib_planner.planning.search.exchange import ChoiceProblem, check_choice, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
+from calib_planner.planning.search.rounding import heaviest_places, improved, rounded
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
 
@@ -312,7 +319,27 @@ def _search(
     for future in futures:
         future.cancel()
     assert best is not None
+    if not clock.over() and (is_sharp(criterion) or not _good_enough(space, design, best)):
+        plans = [best.configurations, *_roundings(space, criterion, design)]
+        result = improved(search, np.stack(plans), clock.over)
+        evaluations += result.evaluations
+        if is_sharp(criterion) or result.log_value > best.log_value:
+            best = result
     return replace(best, starts=done, evaluations=evaluations)
+
+
+def _roundings(space: PlanSpace, criterion: Criterion, design: ApproximateDesign | None) -> list[FloatArray]:
+    """Whole-number plans (m, joints) at the configurations of the approximate design."""
+    if design is None:
+        return []
+    low, high = space.robot.joint_limits.T
+    request = replace(_choice(space, criterion, design.support, design), repeat=True)
+    places = heaviest_places(design.support, design.weights, high - low)
+    try:
+        rows = rounded(request, places, np.random.default_rng(space.problem.search.seed))
+    except InfeasibleError:  # some of its weight is on the spread that keeps it regular
+        return []
+    return [design.support[each] for each in rows]
 
 
 def _agreed(tops: list[float]) -> bool:
@@ -541,16 +568,9 @@ def _bound(
 
 
 def _rounded(space: PlanSpace, target: Criterion, design: ApproximateDesign) -> float:
-    """Ψ of the best whole-number plan, as far as exchange finds it, at the configurations of the design."""
+    """Ψ of the best whole-number plan that is known at the configurations of the design."""
     wanted = target if space.problem.compound else space.search_criterion()
-    try:
-        chosen = choose(
-            replace(_choice(space, wanted, design.support, design), repeat=True),
-            np.random.default_rng(space.problem.search.seed),
-        )
-    except InfeasibleError:  # some of its weight is on the spread that keeps it regular
-        return float("nan")
-    return psi_of(space, target, design.support[chosen.rows])
+    return max((psi_of(space, target, q) for q in _roundings(space, wanted, design)), default=float("nan"))
 
 
 def _terms(space: PlanSpace, inverse: FloatArray) -> tuple[PlannedTerm, ...]:

@@ -130,12 +130,10 @@ def search_chunk(
     size = problem.size
     rows, used = _starts(problem, starts, rng, cancel)
     extended = isinstance(problem.model, ExtendedModel)
-    rough = _descend_from(problem, size, rows, cancel, *(EXTENDED_ROUGH if extended else (80, 1e-4)))
+    rough = descend_from(problem, size, rows, cancel, *(EXTENDED_ROUGH if extended else (80, 1e-4)))
     finalists = rough.x[np.argsort(rough.value)[: 1 if extended else FINALISTS]]
     last = mean_objective(problem, size) if problem.beside else None
-    final = _descend_from(
-        problem, size, finalists, cancel, *(EXTENDED_FINAL if extended else (200, 1e-7)), objective=last
-    )
+    final = descend_from(problem, size, finalists, cancel, *final_settings(problem), objective=last)
     work = used + rough.evaluations + final.evaluations
     if problem.feasibility.constraints and isinstance(problem.model, InformationModel):
         final, more = _along_the_edge(problem, problem.model, final, rng, cancel)
@@ -143,6 +141,11 @@ def search_chunk(
     best = int(np.argmin(final.value))
     configurations = final.x[best].reshape(size, -1)
     return SearchResult(configurations, -float(final.value[best]), starts, work)
+
+
+def final_settings(problem: SearchProblem) -> tuple[int, float]:
+    """Most iterations and tolerance of log Ψ of the last descents."""
+    return EXTENDED_FINAL if isinstance(problem.model, ExtendedModel) else (200, 1e-7)
 
 
 def _along_the_edge(
@@ -158,7 +161,7 @@ def _along_the_edge(
     for _ in range(EDGE_ROUNDS):
         plan = row.reshape(size, -1)
         moved, tried = wander(model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel)
-        descended = _descend_from(problem, size, moved[None], cancel, 60, 1e-6)
+        descended = descend_from(problem, size, moved[None], cancel, 60, 1e-6)
         work += tried + descended.evaluations
         gained = value - float(descended.value[0])
         if gained > 0:
@@ -186,7 +189,7 @@ def _starts(
     tiled = -(-starts // 3) if kernel_size < size and not extended else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
-        kernel = _descend_from(problem, kernel_size, first, cancel, 80, 1e-4)
+        kernel = descend_from(problem, kernel_size, first, cancel, 80, 1e-4)
         evaluations += kernel.evaluations
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
@@ -205,7 +208,7 @@ def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) 
     return np.where(ok[:, :, None], moved, plans)
 
 
-def _descend_from(
+def descend_from(
     problem: SearchProblem,
     size: int,
     rows: FloatArray,
