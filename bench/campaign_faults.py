@@ -40,7 +40,7 @@ from std_srvs.srv import Trigger
 
 from calib_planner import Robot
 from calib_planner.errors import CalibPlannerError
-from calib_planner.io import read_measurements
+from calib_planner.io import read_data
 from calib_planner.ros.demo import DemoClient
 from calib_planner.ros.messages import estimate_from_message
 from calib_planner.ros.parameters import LATCHED
@@ -307,7 +307,7 @@ def lost(desk: Desk, folder: Path, last: CampaignStatus) -> list[str]:
         tuple(p[0])
         for name in ("measurements", "validation")
         if (path := results / f"{name}_{last.campaign_id}.csv").exists()
-        for p in read_measurements(path, robot).data.p.tolist()
+        for p in read_data(path, robot).data.p.tolist()
     ]
     for number, message in told.items():
         p = message.points[0]

@@ -31,7 +31,7 @@ from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, Knowledge, Truth, typical
 from calib_planner.identification import ModelEstimate, fit_error_model, gate_of
-from calib_planner.io import read_measurements
+from calib_planner.io import read_data
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Element
 from calib_planner.tracker import Isotropic, LaserTracker, Noise
@@ -80,10 +80,10 @@ def irb120(folder: Path) -> list[dict[str, Any]]:
     """36 × 3 points → 10 + 30 points of a target that was re-seated twice."""
     robot = Robot.load(folder / "irb120.urdf").with_parameters("full", ("base",))
     three = robot.with_targets(np.zeros((3, 3))).with_parameters("full", ("base", "tool"))
-    found, seconds = timed(three, read_measurements(folder / "calibration.csv", three).data, typical())
+    found, seconds = timed(three, read_data(folder / "calibration.csv", three).data, typical())
     parts, wholes, model = [], [], found.knowledge.model
     for name in ("test_1.csv", "test_2.csv"):
-        data = read_measurements(folder / name, robot).data
+        data = read_data(folder / name, robot).data
         known = found.knowledge.with_new_targets(found.knowledge.robot.target_offsets[:1])
         known = known.updated(data.q[:1], data.p[:1])
         told, rest = known.predict(data.q[1:]), data.select(np.arange(1, len(data)))
@@ -106,7 +106,7 @@ def irb120(folder: Path) -> list[dict[str, Any]]:
 def ur10(folder: Path, name: str, count: int, seeds: int) -> list[dict[str, Any]]:
     """``count`` random rows → the others."""
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
-    data = read_measurements(folder / f"{name}.csv", robot).data
+    data = read_data(folder / f"{name}.csv", robot).data
     result = []
     for seed in range(seeds):
         rows = np.random.default_rng(seed).permutation(len(data))

@@ -35,7 +35,7 @@ from calib_planner import IdentificationProblem, Robot, identify
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel
 from calib_planner.identification import Estimate
-from calib_planner.io import read_measurements, write_measurements
+from calib_planner.io import read_data, write_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.robot import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -80,13 +80,13 @@ def found_by(robot: Robot, data: Measurements, options: dict[str, Any]) -> Estim
 
 def timed(robot: Robot, path: Path, options: dict[str, Any], repeats: int) -> FloatArray:
     """(repeats, 4) seconds by the clock and of the processor, without and with reading the file."""
-    data = read_measurements(path, robot).data
+    data = read_data(path, robot).data
     seconds = []
     for _ in range(repeats):
         times = [(time.perf_counter(), time.process_time())]
         found_by(robot, data, options)
         times.append((time.perf_counter(), time.process_time()))
-        found_by(robot, read_measurements(path, robot).data, options)
+        found_by(robot, read_data(path, robot).data, options)
         times.append((time.perf_counter(), time.process_time()))
         seconds.append(np.diff(times, axis=0).ravel())
     return np.array(seconds)
@@ -131,7 +131,7 @@ def one_cell(robot: Robot, seed: int, urdf: Path | None, python: str | None, rep
         before = {name: timed(question, path, options, repeats) for name, options in mine.items()}
         theirs = figaroh(urdf, path.parent, truth, python) if urdf and python else {}
         after = {name: timed(question, path, options, repeats) for name, options in mine.items()}
-        data = read_measurements(path, question).data
+        data = read_data(path, question).data
     run: dict[str, Any] = {}
     for name, options in mine.items():
         keys = ("seconds", "cpu_seconds", "seconds_with_file", "cpu_seconds_with_file")

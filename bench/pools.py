@@ -28,7 +28,7 @@ import numpy as np
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.identification import start_robot
-from calib_planner.io import read_measurements
+from calib_planner.io import read_data
 from calib_planner.planning import (
     Candidates,
     ChoiceProblem,
@@ -48,7 +48,7 @@ def ur10(data: Path) -> tuple[Robot, FloatArray]:
     """The robot with tracker and target at their closed-form start, and all measured configurations."""
     folder = data / "ur10_tracker"
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
-    measured = read_measurements(folder / "random_poses.csv", robot).data
+    measured = read_data(folder / "random_poses.csv", robot).data
     return start_robot(robot, measured.select(np.arange(0, len(measured), 5))), measured.q
 
 

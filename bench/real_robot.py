@@ -25,7 +25,7 @@ from calib_planner import IdentificationProblem, Robot, identify
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import ErrorModel
 from calib_planner.identification import start_robot
-from calib_planner.io import read_measurements
+from calib_planner.io import read_data
 from calib_planner.measurements import Measurements
 from calib_planner.planning import Candidates, PlanProblem, plan, usual_error_model
 from calib_planner.tracker import Isotropic
@@ -155,7 +155,7 @@ def main() -> None:
         print(f"real_robot: no measured data at {args.data}: nothing measured")
         return
     robot = Robot.load(folder / "ur10.urdf").with_parameters("full", ("base", "tool"))
-    data = read_measurements(folder / "random_poses.csv", robot).data
+    data = read_data(folder / "random_poses.csv", robot).data
     robot = start_robot(robot, data.select(np.arange(0, len(data), 5)))
     judges, ways = {"default": Estimator(robot, data)}, planners(robot, args.others)
     entries = []

@@ -3,7 +3,7 @@
 A room's ``__init__`` lists its names twice: under ``TYPE_CHECKING`` as imports, for type checkers and editors,
 and in a table, for programs:
 
-    __getattr__, __dir__, __all__ = lazy_door(__name__, {"csv": "read_measurements write_measurements"})
+    __getattr__, __dir__, __all__ = lazy_door(__name__, {"csv": "read_data write_measurements"})
 """
 
 from __future__ import annotations

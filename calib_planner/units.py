@@ -6,19 +6,30 @@ file or over a wire are of any length; messages show no more of them than a line
 
 from __future__ import annotations
 
+import math
 import re
 import reprlib
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
+
+from calib_planner.errors import InputError
 
 MOST_CHARACTERS = 60
 """Characters of a refused value that an error shows."""
 
+LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3, "µm": 1e-6, "in": 0.0254, "ft": 0.3048}
+"""Unit of length in files and options → metres."""
+
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "gon": math.pi / 200.0}
+"""Unit of angle in files and options → radians."""
+
 PER_UNIT = {
-    "m": {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "µm": 1e6, "μm": 1e6, "nm": 1e9, "in": 1 / 0.0254},
+    "m": {n: 1.0 / LENGTHS[n] for n in ("m", "cm", "mm", "µm")}
+    | {"um": 1e6, "μm": 1e6, "nm": 1e9, "in": 1.0 / LENGTHS["in"]},
     "rad": {"rad": 1.0, "mrad": 1e3, "urad": 1e6, "µrad": 1e6, "μrad": 1e6}
-    | dict.fromkeys(("deg", "°"), 180.0 / np.pi),
+    | dict.fromkeys(("deg", "°"), 1.0 / ANGLES["deg"]),
     "s": {"s": 1.0, "ms": 1e3, "min": 1 / 60, "h": 1 / 3600},
     "kg": {"kg": 1.0, "g": 1e3},
 }
@@ -27,6 +38,56 @@ QUANTITY = re.compile(r"\s*([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf))\
 
 MILLI_UNIT = {"m": "mm", "rad": "mrad"}
 """Unit of a parameter → the unit of 1000 times its value, which tables for people show."""
+
+SPELLINGS = {
+    **{name: name for name in (*LENGTHS, *ANGLES)},
+    **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
+    **dict.fromkeys(("millimetre", "millimetres", "millimeter", "millimeters"), "mm"),
+    **dict.fromkeys(("centimetre", "centimetres", "centimeter", "centimeters"), "cm"),
+    **dict.fromkeys(("um", "μm", "micron", "microns", "micrometre", "micrometres", "micrometer"), "µm"),
+    **dict.fromkeys(("inch", "inches", '"'), "in"),
+    **dict.fromkeys(("foot", "feet"), "ft"),
+    **dict.fromkeys(("radian", "radians", "rads"), "rad"),
+    **dict.fromkeys(("degree", "degrees", "degs", "°", "º"), "deg"),
+}
+"""How people write units, in small letters → the unit's name here."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units of the numbers in a file; an empty text where nothing is said.
+
+    Attributes:
+        length: A key of ``LENGTHS``.
+        angle: A key of ``ANGLES``.
+    """
+
+    length: str = ""
+    angle: str = ""
+
+    def __str__(self) -> str:
+        return ",".join(filter(None, (self.length, self.angle)))
+
+    @staticmethod
+    def parse(text: str, field: str = "--units") -> Units:
+        """``mm,deg``, ``deg`` or ``millimetres degrees`` as units.
+
+        Raises:
+            InputError: A word is no unit, or there are two of one kind.
+        """
+        said: dict[str, str] = {}
+        for word in text.replace(",", " ").split():
+            unit = SPELLINGS.get(word.casefold(), "")
+            kind = "length" if unit in LENGTHS else "angle"
+            if not unit or kind in said:
+                valid = f"one of {', '.join(LENGTHS)}, or of {', '.join(ANGLES)}, or one of each"
+                raise InputError(field, repr(text), valid, f"for example {field} mm,deg")
+            said[kind] = unit
+        return Units(**said)
+
+
+UNSAID = Units()
+SI = Units("m", "rad")
 
 
 def quantity(text: str, unit: str = "m") -> float:

@@ -34,13 +34,13 @@ def record_bag(folder: Path) -> None:
     from bags import campaign, write_bag
 
     from calib_planner import Robot
-    from calib_planner.io import read_measurements
+    from calib_planner.io import read_data
     from calib_planner.simulation import SimulatedCell, random_deviations
 
     robot = Robot.load(DOCS / "examples" / "ur10e.urdf").with_targets([[0.06, 0.0, 0.03]])
     robot = robot.with_base(np.eye(3), [2.0, -1.0, 0.5])
     cell = SimulatedCell(robot, random_deviations(robot, 1))
-    stops = read_measurements(DOCS / "examples" / "measured.csv", robot).data.q[:14]
+    stops = read_data(DOCS / "examples" / "measured.csv", robot).data.q[:14]
     write_bag(folder / "monday_1", campaign(cell, stops), ("/joint_states", "/leica/point"))
 
 

@@ -3,8 +3,9 @@
 A message is anything with the fields of ``sensor_msgs/msg/JointState`` or ``geometry_msgs/msg/PointStamped``:
 those of rclpy and those that rosbags decodes are alike. Only the stamps in their headers count. A joint state
 names its joints every time, in its own order and among others; where each one stands is remembered as long as
-the names stay the same. The points of all targets are in one frame, the first one that is named: a mean of
-points in two frames has no meaning. What takes no part is counted by reason.
+the names stay the same. Several publishers may share the robot's joints: their states are put together. The
+points of all targets are in one frame, the first one that is named: a mean of points in two frames has no
+meaning. What takes no part is counted by reason.
 """
 
 from __future__ import annotations
@@ -136,8 +137,16 @@ def stamp_of(message: JointStateLike | PointLike) -> int:
     return int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
 
 
+PARTS_APART = NANO // 10
+"""States of some joints each belong together if their stamps are no further apart [ns]: as long as a robot is
+given to settle, so that a value from before the rest does not look like one of the rest."""
+
+
 class JointReader:
     """Reads joint states that name joints in any order, among others.
+
+    A state that names only some of the joints is put together with those before it: the result is complete once
+    every joint came since the last complete one.
 
     Args:
         joint_names: Joints wanted, in the order wanted.
@@ -147,22 +156,45 @@ class JointReader:
         self._wanted = tuple(joint_names)
         self._names: list[str] = []
         self._columns: list[int] = []
+        self._latest: dict[str, tuple[int, float]] = {}
+        self._waiting = set(self._wanted)
 
-    def read(self, message: JointStateLike) -> FloatArray:
-        """Positions (joints,) [rad | m] in the order wanted; values may be NaN.
+    def read(self, message: JointStateLike) -> FloatArray | None:
+        """Positions (joints,) [rad | m] in the order wanted; values may be NaN. ``None``: other joints are to
+        come.
 
         Raises:
-            UnknownNameError: A joint is missing.
+            UnknownNameError: A joint is missing, and no state shortly before had it.
             InputError: A name is there twice, or names and positions differ in number.
         """
         names, positions = message.name, message.position
         if names != self._names or not names:
+            if len(names) == len(positions) and self._is_part(names):
+                return self._together(stamp_of(message), names, positions)
             pick_joints(names, positions, self._wanted)
             self._names, self._columns = list(names), [names.index(n) for n in self._wanted]
         elif len(positions) != len(names):
             got = f"{len(positions)} positions for {len(names)} names"
             raise InputError("position", got, "one position per name")
         return np.array([positions[k] for k in self._columns])
+
+    def _is_part(self, names: Sequence[str]) -> bool:
+        """Whether a state names some of the joints, each once, but not all."""
+        ours = [n for n in names if n in self._wanted]
+        return 0 < len(ours) < len(self._wanted) and len(set(ours)) == len(ours)
+
+    def _together(self, stamp: int, names: Sequence[str], positions: Sequence[float]) -> FloatArray | None:
+        for name, value in zip(names, positions, strict=True):
+            if name in self._wanted:
+                self._latest[name] = stamp, float(value)
+                self._waiting.discard(name)
+        for name in self._wanted:
+            if name not in self._latest or abs(stamp - self._latest[name][0]) > PARTS_APART:
+                raise UnknownNameError("name", name, list(names)[:MOST_NAMES])
+        if self._waiting:
+            return None
+        self._waiting = set(self._wanted)
+        return np.array([self._latest[name][1] for name in self._wanted])
 
 
 class Intake:
@@ -215,6 +247,8 @@ class Intake:
             names = f"it names {', '.join(message.name[:MOST_NAMES])}"
             count.leave_out(UNFIT, str(error), names if isinstance(error, UnknownNameError) else str(error))
             raise
+        if joints is None:
+            return []
         if not np.isfinite(joints).all():
             count.left_out[NOT_FINITE] += 1
         return self._explained(self.detector.add_joints(stamp, joints))

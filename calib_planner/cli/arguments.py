@@ -13,10 +13,10 @@ import numpy as np
 from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
-from calib_planner.io import angle_factors, read_configurations
+from calib_planner.io import Reading, angle_factors, read_configurations
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic
-from calib_planner.units import quantity
+from calib_planner.units import UNSAID, Units, quantity
 
 if TYPE_CHECKING:
     from calib_planner.planning import Pace
@@ -109,7 +109,8 @@ def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: 
     if targets:
         text = "a reflector in the frame of the last link [m]; repeat for several"
         option(group, "--targets", '"x y z"', text, kind=numbers, action="append")
-    switch(group, "--degrees", "angles in arguments and input CSV files are degrees; output is always in radians")
+    text = "angles in arguments, and in files where nothing else is written, are degrees; output is in radians"
+    switch(group, "--degrees", text)
 
 
 def add_links(group: Group) -> None:
@@ -128,13 +129,71 @@ def add_parameters(parser: argparse.ArgumentParser, unknown: str = "none") -> No
     group.add_argument("--unknown", default="", metavar="U", help=text)
 
 
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """What may be stated about tables that are read."""
+    group = parser.add_argument_group("tables that are read (what is not stated is recognised, and said)")
+    text = "units of lengths and angles in files, and of angles in arguments: m, mm, cm, in, …; rad, deg, …"
+    group.add_argument("--units", action=_Units, metavar="U", help=f"{text} (m,rad)")
+    text = "names of all columns, in order: joints, x1 y1 z1 x2 …, std_x1 …; '-' for one that plays no part"
+    option(group, "--columns", '"q1 … z1"', text, kind=column_names)
+    option(
+        group, "--separator", "S", "what separates the cells of text: comma, semicolon, tab, bar or white space"
+    )
+
+
+class _Units(argparse.Action):
+    """--units, of which degrees hold for arguments too."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        try:
+            namespace.units = Units.parse(values)
+        except InputError as error:
+            raise argparse.ArgumentError(
+                self, f"expected {error.expected}, got {error.got}; {error.advice}"
+            ) from None
+        if namespace.units.angle:
+            namespace.degrees = namespace.units.angle == "deg"
+
+
+def column_names(text: str) -> tuple[str, ...]:
+    """Names of columns separated by blanks or commas; ``q1 … q6`` stands for those between."""
+    names: list[str] = []
+    words = text.replace(",", " ").split()
+    for i, word in enumerate(words):
+        if word not in ("…", "..."):
+            names.append(word)
+            continue
+        ends = [re.fullmatch(r"(.*?)(\d+)", w) for w in (*words[i - 1 : i], *words[i + 1 : i + 2])]
+        if len(ends) != 2 or None in ends or ends[0][1] != ends[1][1]:  # type: ignore[index]
+            raise argparse.ArgumentTypeError(
+                f"expected numbered names around {word}, as in q1 … q6, got {text!r}"
+            )
+        first, last = (int(e[2]) for e in ends)  # type: ignore[index]
+        names += [f"{ends[0][1]}{k}" for k in range(first + 1, last)]  # type: ignore[index]
+    return tuple(names)
+
+
+def reading_of(args: argparse.Namespace, terminal: Terminal | None = None, **more: Any) -> Reading:
+    """How the options of ``add_reading`` say that tables are read; ``more``: further fields of ``Reading``."""
+    other = Units("mm" if getattr(args, "millimetres", False) else "", "deg" if args.degrees else "")
+    note = (terminal or Terminal(json_wanted=args.json)).note
+    return Reading(
+        units=getattr(args, "units", None) or UNSAID,
+        otherwise=other,
+        columns=getattr(args, "columns", None) or (),
+        separator=getattr(args, "separator", None) or "",
+        note=note,
+        **more,
+    )
+
+
 def add_test_poses(parser: Group, purpose: str) -> None:
     text = f"joint coordinates [rad | m] {purpose}; repeat for several"
     option(parser, "--test-pose", '"q1 … qn"', text, kind=numbers, action="append")
 
 
 def add_test_path(parser: Group) -> None:
-    option(parser, "--test-path", "FILE", "CSV with a column per joint; every row is a test pose")
+    option(parser, "--test-path", "FILE", "table with a column per joint; every row is a test pose")
 
 
 def numbers(text: str) -> list[float]:
@@ -183,7 +242,7 @@ def test_poses(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
     if args.test_pose is not None:
         poses.append(joint_rows("--test-pose", args.test_pose, robot, args))
     if getattr(args, "test_path", None) is not None:
-        poses.append(read_configurations(args.test_path, robot, degrees=args.degrees))
+        poses.append(read_configurations(args.test_path, robot, reading_of(args)))
     return np.vstack(poses) if poses else None
 
 

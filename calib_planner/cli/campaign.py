@@ -30,6 +30,7 @@ from calib_planner.cli.arguments import (
     add_command,
     add_conditions,
     add_parameters,
+    add_reading,
     add_robot,
     add_seed,
     add_test_path,
@@ -38,6 +39,7 @@ from calib_planner.cli.arguments import (
     conditions,
     load_robot,
     option,
+    reading_of,
     require_test_poses,
     test_poses,
 )
@@ -47,8 +49,8 @@ from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError
 from calib_planner.io import (
     make_folder,
+    read_data,
     read_error_model,
-    read_measurements,
     write_configurations,
     write_estimate,
     write_measurements,
@@ -83,6 +85,7 @@ def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "campaign", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
+    add_reading(parser)
     add_parameters(parser)
     wanted = parser.add_argument_group("what is wanted")
     add_test_poses(wanted, "where accuracy matters")
@@ -99,8 +102,8 @@ def add(commands: Commands, summary: str) -> None:
     option(work, "--error-model", "E", text, "typical")
     add_gravity(parser, measured=False)
     hand = parser.add_argument_group("by hand")
-    option(hand, "--measured", "FILE", "CSV of what was measured for the fit so far")
-    option(hand, "--held-out", "FILE", "CSV of what was measured for validation")
+    option(hand, "--measured", "FILE", "table of what was measured for the fit so far")
+    option(hand, "--held-out", "FILE", "table of what was measured for validation")
     option(hand, "--next", "FILE", "write what to measure next: .csv with repetitions")
     play = parser.add_argument_group("in simulation")
     option(play, "--simulate", "SEED", "measure a simulated robot with hidden errors", kind=int)
@@ -196,7 +199,7 @@ def _by_hand(args: argparse.Namespace, problem: CampaignProblem, terminal: Termi
 
 def _read(args: argparse.Namespace, problem: CampaignProblem, option: str) -> Measurements | None:
     path = getattr(args, option)
-    return None if path is None else read_measurements(path, problem.robot, degrees=args.degrees).data
+    return None if path is None else read_data(path, problem.robot, reading_of(args)).data
 
 
 # ── in simulation ────────────────────────────────────────────────────────────────────────────────────

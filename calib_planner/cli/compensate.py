@@ -13,11 +13,13 @@ from rich.table import Table
 from calib_planner.cli.arguments import (
     Commands,
     add_command,
+    add_reading,
     add_robot,
     add_seed,
     load_robot,
     numbers,
     option,
+    reading_of,
     switch,
 )
 from calib_planner.cli.gravity import add_payload, payload_of
@@ -45,6 +47,7 @@ ERRORS = ("position_error", "rotation_error", "reached")
 def add(commands: Commands, summary: str) -> None:
     parser = add_command(commands, "compensate", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser, targets=False)
+    add_reading(parser)
     what = parser.add_argument_group("what to correct")
     option(what, "--estimate", "FILE", "estimate, written by identify --output", required=True)
     text = "CSV of joint targets [rad | m]"
@@ -73,7 +76,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         nominal = nominal.with_targets(calibrated.target_offsets)
     if args.tool is not None:
         nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
-    q = read_configurations(args.joint_targets, nominal, degrees=args.degrees)
+    q = read_configurations(args.joint_targets, nominal, reading_of(args, terminal))
     with terminal.working("correcting"):
         result = compensate(
             nominal,

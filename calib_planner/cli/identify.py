@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -17,14 +17,18 @@ from calib_planner.cli.arguments import (
     KNOWN,
     TYPICAL,
     Commands,
+    Group,
     add_command,
     add_parameters,
+    add_reading,
     add_robot,
     add_seed,
     add_test_poses,
     choose_parameters,
+    column_names,
     load_robot,
     option,
+    reading_of,
     switch,
     test_poses,
 )
@@ -43,8 +47,8 @@ from calib_planner.identification import (
 )
 from calib_planner.io import (
     BagTopics,
+    Reading,
     Sources,
-    SourceSettings,
     is_bag,
     placement,
     read_instrument,
@@ -67,9 +71,10 @@ EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv -
 
 DESCRIPTION = """Identify the robot's parameters from measured points.
 
-A CSV has a column per joint [rad | m], in any order, and x1,y1,z1[,x2,…] per reflector in the tracker's
-frame [m]; empty cells: not measured. Optional std_x1,… [m] weigh the points. Other columns are ignored. A bag
-(folder, .db3, .mcap) gives a row per standstill.
+A table has a column per joint, in any order, and x1,y1,z1[,x2,…] per reflector in the tracker's frame; empty
+cells: not measured. Optional std_x1,… weigh the points. Other columns are ignored. What a file is like
+(separator, decimal mark, columns, units) is recognised and said. A bag (folder, .db3, .mcap) gives a row per
+standstill.
 
 The verdict comes first: PASS, WARN or FAIL, with reasons and what to do. It does not change the exit status:
 a calibration that failed its checks is an answer too. Rows count from 0 in JSON and estimate files."""
@@ -79,6 +84,7 @@ def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "identify", summary, run, EXAMPLE, DESCRIPTION)
     add_robot(parser)
+    add_reading(parser)
     add_parameters(parser, "told by the points; none: both are as the robot and --targets say")
     add_data(parser)
     add_noise(parser)
@@ -95,13 +101,13 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     check_files(args)
     robot = load_robot(args)
     check_outputs(args, robot)
-    settings = source_settings(args, terminal)
+    reading = source_reading(args, terminal)
     noise_given = args.sigma is not None or args.instrument is not None
-    sources = read_sources(args.data, robot, settings, noise_given=noise_given)
+    sources = read_sources(args.data, robot, reading, noise_given=noise_given)
     _find_unknown(robot, sources, args, terminal)
     robot = _with_targets(robot, sources, args)
     problem = _problem(robot, sources, args, terminal)
-    held_out = [_held_out(path, robot, args, settings) for path in args.validate or ()]
+    held_out = [_held_out(path, robot, args, replace(reading, points=())) for path in args.validate or ()]
     with terminal.working("identifying"):
         estimate = _estimate(problem, held_out, args)
     settled = estimate.fit.status != "not_converged"
@@ -143,9 +149,9 @@ def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args
     return validate(problem, estimate, held_out, args.validate_target_from)
 
 
-def _held_out(path: str, robot: Robot, args: argparse.Namespace, settings: SourceSettings) -> Measurements:
+def _held_out(path: str, robot: Robot, args: argparse.Namespace, reading: Reading) -> Measurements:
     """A file of --validate; re-seated targets may be as many as they like."""
-    data = read_source(path, robot, settings).data
+    data = read_source(path, robot, reading).data
     count, most = data.p.shape[1], len(robot.targets)
     if count > most and not args.validate_target_from:
         advice = "other reflectors need --validate-target-from N"
@@ -200,14 +206,29 @@ BAG_ONLY = ("joint_topic", "point_topic", *STANDSTILL, "repeatability", "accept_
 
 
 def add_data(parser: argparse.ArgumentParser) -> None:
-    """--data, --millimetres and what bags need."""
+    """--data, its points, --millimetres and what bags need."""
     data = parser.add_argument_group("measurements")
-    text = "CSV or bag; repeat to take several together"
+    text = "table (text, XLSX, MAT, NPY, NPZ, JSON) or bag; repeat to take several together"
     option(data, "--data", "FILE", text, required=True, action="append")
-    switch(data, "--millimetres", "points and std_… of all CSV files are in mm")
+    add_points(data)
+    add_bags(parser)
+
+
+def add_points(data: Group) -> None:
+    """--points, what may be stated about them, and --millimetres."""
+    text = "list of points of --data, which then has the joints only; repeat, one list per reflector"
+    option(data, "--points", "FILE", text, action="append")
+    option(data, "--point-columns", '"name x y z"', "as --columns, for --points", kind=column_names)
+    text = "how points and joints belong together: name, time or order (the first that is possible)"
+    option(data, "--match", None, text, choices=("name", "time", "order"))
+    switch(data, "--millimetres", "lengths in files where nothing else is written are in mm")
+
+
+def add_bags(parser: argparse.ArgumentParser) -> None:
+    """What bags need."""
     bags = parser.add_argument_group("measurements from bags (docs/real-robot-data.md)")
     option(bags, "--joint-topic", "T", "topic of sensor_msgs/JointState (joint_states)")
-    text = "topic of geometry_msgs/PointStamped; repeat, one per reflector (tracker/point)"
+    text = "topic of PointStamped, PoseStamped or TransformStamped; repeat, one per reflector (tracker/point)"
     option(bags, "--point-topic", "T", text, action="append")
     for field in (f for f in fields(StandstillSettings) if f.name in STANDSTILL):
         unit = f" [{field.metadata['unit']}]" if field.metadata["unit"] else ""
@@ -219,17 +240,19 @@ def add_data(parser: argparse.ArgumentParser) -> None:
     bags.add_argument("--accept-damaged", action="store_true", default=None, help=text)
 
 
-def source_settings(args: argparse.Namespace, terminal: Terminal) -> SourceSettings:
-    """How the options of ``add_data`` say that files are read."""
+def source_reading(args: argparse.Namespace, terminal: Terminal) -> Reading:
+    """How the options of ``add_data`` and ``add_reading`` say that files are read."""
     given = {name: getattr(args, name) for name in STANDSTILL if getattr(args, name) is not None}
-    return SourceSettings(
-        degrees=args.degrees,
-        millimetres=args.millimetres,
+    return reading_of(
+        args,
+        terminal,
+        points=tuple(args.points or ()),
+        point_columns=args.point_columns or (),
+        match=args.match or "",
         topics=BagTopics(args.joint_topic or "joint_states", tuple(args.point_topic or ("tracker/point",))),
         standstill=StandstillSettings(**given),
         repeatability=args.repeatability or 0.0,
         accept_damaged=bool(args.accept_damaged),
-        note=terminal.note,
         progress=terminal.progress,
     )
 
@@ -238,7 +261,7 @@ def check_files(args: argparse.Namespace) -> None:
     """Refuse what does not go with the files given.
 
     Raises:
-        InputError: A file twice, an option for bags without a bag, or --millimetres with one.
+        InputError: A file twice, points for several files or none, or an option for bags without a bag.
     """
     taken = set()
     for flag, path in [("--data", p) for p in args.data] + [("--validate", p) for p in args.validate or ()]:
@@ -248,12 +271,24 @@ def check_files(args: argparse.Namespace) -> None:
             raise InputError(flag, f"{path} again", "each file once", advice)
         taken.add(place)
     bags = [path for path in (*args.data, *(args.validate or ())) if is_bag(path)]
-    if bags and args.millimetres:
-        advice = "points in bags are in metres (REP-103)"
-        raise InputError("--millimetres", f"the bag {bags[0]}", "CSV files", advice)
+    check_points(args)
     for name in BAG_ONLY:
         if not bags and getattr(args, name) is not None:
             raise InputError(_flag(name), getattr(args, name), "a bag among --data or --validate")
+
+
+def check_points(args: argparse.Namespace) -> None:
+    """Refuse points that cannot belong to the files of --data.
+
+    Raises:
+        InputError: Points for several files, or something about points without any.
+    """
+    if args.points and (len(args.data) > 1 or is_bag(args.data[0])):
+        got = f"{len(args.data)} files" if len(args.data) > 1 else "a bag"
+        raise InputError("--points", got, "one table of joints as --data", "import the pairs one by one")
+    for flag, value in (("--point-columns", args.point_columns), ("--match", args.match)):
+        if value and not args.points:
+            raise InputError(flag, value, "--points FILE beside it")
 
 
 def _flag(name: str) -> str:
@@ -302,7 +337,7 @@ def add_checks(parser: argparse.ArgumentParser) -> None:
     option(check, "--accuracy-frame", None, text, DEFAULTS["accuracy_frame"], choices=ACCURACIES)
     text = "largest error that is acceptable at a test pose [m] (not checked)"
     option(check, "--required-accuracy", "A", text, kind=float)
-    option(check, "--validate", "FILE", "held-out CSV or bag; repeat for several", action="append")
+    option(check, "--validate", "FILE", "held-out table or bag; repeat for several", action="append")
     text = "the reflector was re-seated: its offset comes from the first N rows of each held-out file"
     option(check, "--validate-target-from", "N", text, 0)
     add_seed(check)

@@ -35,7 +35,7 @@ from calib_planner.identification import IdentificationProblem, find_misplacemen
 from calib_planner.io import (
     CELL_KEYS,
     Cell,
-    SourceSettings,
+    Reading,
     read_constraints,
     read_instrument,
     read_sources,
@@ -46,7 +46,7 @@ from calib_planner.io import (
 )
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.units import counted, length
+from calib_planner.units import Units, counted, length
 
 EXAMPLE = """calib-planner init --robot irb120.urdf --data calibration.csv --sigma 20um
   calib-planner identify --cell cell.yaml --data calibration.csv"""
@@ -234,15 +234,18 @@ def try_cell(args: argparse.Namespace, robot: Robot, terminal: Terminal) -> Tria
     trials: list[Trial] = []
     refused: FileFormatError | None = None
     for units in (stated, *(u for u in TRIED_UNITS if set(u) > set(stated))):
-        settings = SourceSettings(degrees="deg" in units, millimetres="mm" in units, progress=terminal.progress)
+        otherwise = Units("mm" if "mm" in units else "", "deg" if "deg" in units else "")
+        reading = Reading(otherwise=otherwise, progress=terminal.progress)
         try:
-            data = read_sources([args.data], robot, settings, noise_given=False).data
+            sources = read_sources([args.data], robot, reading, noise_given=False)
         except FileFormatError as error:
             if not error.field.endswith("measurements"):  # which is how check_units refuses units
                 raise
             refused = refused or error
             continue
-        trials.append(_trial(args, robot, data, units))
+        of_file = sources.files[0].understanding.units
+        recognised = tuple(u for u in ("mm", "deg") if u in (of_file.length, of_file.angle))
+        trials.append(_trial(args, robot, sources.data, recognised))
         if trials[-1].agrees:
             return trials[-1]
     if not trials:

@@ -19,6 +19,7 @@ from calib_planner.cli.arguments import (
     add_conditions,
     add_pace,
     add_parameters,
+    add_reading,
     add_robot,
     add_seed,
     add_test_path,
@@ -30,6 +31,7 @@ from calib_planner.cli.arguments import (
     numbers,
     option,
     paced,
+    reading_of,
     require_test_poses,
     seconds,
     start_of,
@@ -44,8 +46,8 @@ from calib_planner.errors import InputError
 from calib_planner.io import (
     make_folder,
     read_configurations,
+    read_data,
     read_error_model,
-    read_measurements,
     read_prior,
     write_configurations,
     write_plan,
@@ -210,6 +212,7 @@ def _write(output: str, plan: Plan) -> None:
 def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argparse._ArgumentGroup:
     """Add the arguments; returns the group about what may be measured, for the sizes."""
     add_robot(parser)
+    add_reading(parser)
     add_parameters(parser)
     wanted = parser.add_argument_group("where accuracy matters")
     add_test_poses(wanted, "where accuracy matters")
@@ -322,13 +325,13 @@ def _prior(given: str | None, robot: Robot) -> Prior | None:
 def _measured(args: argparse.Namespace, robot: Robot) -> Any:
     if args.measured is None:
         return None
-    return read_measurements(args.measured, robot, degrees=args.degrees).data
+    return read_data(args.measured, robot, reading_of(args)).data
 
 
 def _candidates(args: argparse.Namespace, robot: Robot) -> Candidates | None:
     if getattr(args, "candidates", None) is None:
         return None
-    rows = read_configurations(args.candidates, robot, degrees=args.degrees)
+    rows = read_configurations(args.candidates, robot, reading_of(args))
     return Candidates(rows, args.repeat_candidates)
 
 

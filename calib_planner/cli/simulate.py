@@ -16,11 +16,13 @@ from calib_planner.cli.arguments import (
     Commands,
     add_command,
     add_parameters,
+    add_reading,
     add_robot,
     add_seed,
     choose_parameters,
     load_robot,
     option,
+    reading_of,
 )
 from calib_planner.cli.gravity import add_gravity, error_model_of
 from calib_planner.cli.terminal import Terminal
@@ -44,6 +46,7 @@ EXAMPLE = """calib-planner simulate --robot kuka_kr270 --plan plan.yaml --seed 7
 def add(commands: Commands, summary: str) -> None:
     parser = add_command(commands, "simulate", summary, run, EXAMPLE)
     add_robot(parser)
+    add_reading(parser)
     add_parameters(parser)
     text = "plan .yaml, or a .csv with a column per joint and optionally one named repetitions"
     option(parser, "--plan", "FILE", text, required=True)
@@ -121,7 +124,7 @@ def _plan(robot: Robot, args: argparse.Namespace) -> tuple[FloatArray, IntArray 
         q = plan.configurations[:, [plan.joint_names.index(n) for n in robot.joint_names]]
         repetitions = plan.repetitions
     else:
-        q, repetitions = read_plan_csv(args.plan, robot, degrees=args.degrees)
+        q, repetitions = read_plan_csv(args.plan, robot, reading_of(args))
     return q, repetitions if args.repetitions is None else args.repetitions
 
 

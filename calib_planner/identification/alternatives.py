@@ -59,7 +59,7 @@ from calib_planner.identification.likelihood import (
 from calib_planner.identification.registration import place, tip_poses
 from calib_planner.measurements import Measurements
 from calib_planner.robot import BASE_PARAMETERS, Robot, is_nuisance, target_parameters
-from calib_planner.units import counted, length, listed, milliradians
+from calib_planner.units import SPELLINGS, counted, length, listed, milliradians
 
 BoolArray = NDArray[np.bool_]
 
@@ -1218,8 +1218,7 @@ class _Gross:
         unit = next((u for u, s in UNITS.items() if s == scale), None)
         if unit is not None:
             texts.append(f"the points are in {unit}")
-            given = f"multiply the coordinates in the data by {1.0 / scale:.6g}"
-            advice.append("add --millimetres" if unit == "millimetres" else given)
+            advice.append("add --millimetres" if unit == "millimetres" else f"add --units {SPELLINGS[unit]}")
         elif scale < 1.0:
             texts.append("the points are a thousand times too close together")
             advice.append(

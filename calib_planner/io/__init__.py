@@ -11,18 +11,19 @@ from calib_planner.doors import lazy_door
 from calib_planner.io.robots import URDF_SUFFIXES, Robot, config_folder, shipped_robots
 
 if TYPE_CHECKING:
-    from calib_planner.io.bag import BagTopics, is_bag, read_bag
+    from calib_planner.io.bag import read_bag
     from calib_planner.io.cell import CELL_KEYS, EITHER, Cell, read_cell, write_cell
     from calib_planner.io.conditions import read_constraints, read_instrument, read_vertical
-    from calib_planner.io.csv import (
+    from calib_planner.io.csv import format_table, measurements_text, write_configurations, write_measurements
+    from calib_planner.io.data import (
         angle_factors,
-        format_table,
-        measurements_text,
+        in_units,
+        is_bag,
         read_configurations,
-        read_measurements,
+        read_data,
+        read_joints,
         read_plan_csv,
-        write_configurations,
-        write_measurements,
+        with_units,
     )
     from calib_planner.io.error_model import read_error_model, write_error_model
     from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
         read_program_format,
         write_program,
     )
-    from calib_planner.io.sources import Sources, SourceSettings, read_source, read_sources
+    from calib_planner.io.sources import Sources, read_source, read_sources
     from calib_planner.io.store import (
         ACCEPTED,
         CLOCK_OFFSET,
@@ -75,6 +76,7 @@ if TYPE_CHECKING:
         stored_model,
     )
     from calib_planner.io.text import fresh_folder, make_folder, read_text, user_path, write_text
+    from calib_planner.io.understanding import BagTopics, JointTable, Reading, Source, Understanding
     from calib_planner.io.urdf import (
         calibrated_urdf,
         parse_speed_limits,
@@ -87,11 +89,12 @@ else:
     __getattr__, __dir__, __all__ = lazy_door(
         __name__,
         {
-            "bag": "BagTopics is_bag read_bag",
+            "bag": "read_bag",
             "cell": "CELL_KEYS EITHER Cell read_cell write_cell",
             "conditions": "read_constraints read_instrument read_vertical",
-            "csv": "angle_factors format_table measurements_text read_configurations read_measurements "
-            "read_plan_csv write_configurations write_measurements",
+            "csv": "format_table measurements_text write_configurations write_measurements",
+            "data": "angle_factors in_units is_bag read_configurations read_data read_joints read_plan_csv "
+            "with_units",
             "error_model": "read_error_model write_error_model",
             "estimate": "calibrated_robot placement read_estimate write_estimate",
             "kinematics": "read_kinematics write_kinematics",
@@ -100,11 +103,12 @@ else:
             "prior": "read_prior",
             "programs": "HANDSHAKES SETTLE SPEED_SHARE ProgramFormat ProgramSettings controller_axes "
             "program_formats program_name program_text read_program_format write_program",
-            "sources": "Sources SourceSettings read_source read_sources",
+            "sources": "Sources read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
             "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "
             "open_campaign open_store stored_model",
             "text": "fresh_folder make_folder read_text user_path write_text",
+            "understanding": "BagTopics JointTable Reading Source Understanding",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
             "write_calibrated_urdf",
         },

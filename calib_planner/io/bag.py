@@ -9,6 +9,10 @@ The live node and a bag decide alike: every message goes, in the order of record
 with the same settings, and only the stamps in the headers count. Every standstill is a row of its own, also
 if the robot was there before. Every message that took no part is counted by topic and reason. A bag whose end
 cannot be read is refused, unless the part before is explicitly accepted.
+
+Messages hold metres and radians (REP-103). Where a driver sends millimetres or degrees, the sizes of the
+numbers at the beginning of the recording tell, as in tables; the messages are converted before anything is
+decided about them.
 """
 
 from __future__ import annotations
@@ -19,7 +23,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,18 +45,23 @@ from calib_planner.acquisition import (
 )
 from calib_planner.arrays import IntArray, check_number, frozen
 from calib_planner.errors import FileFormatError, InputError, MissingExtraError
+from calib_planner.io.sizes import angles_by_size, lengths_by_size
 from calib_planner.io.text import user_path
+from calib_planner.io.understanding import STORAGE, BagTopics
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.units import cut, listed
+from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, cut, listed
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POINT = "geometry_msgs/msg/PointStamped"
-STORAGE = (".db3", ".mcap")
+POINTS = (POINT, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped")
+"""Types of messages that hold a point: of poses and transforms it is the position."""
 WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
 REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
 REPORT_EVERY = 2000
 """Messages between two reports of progress."""
+LOOKED_AT = 20_000
+"""Messages from the beginning whose sizes tell the units: minutes of a robot that moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +75,8 @@ class BagMeasurements:
         streams: What became of the messages, joints first, then each target.
         frame_id: Frame of the points; empty if no message told.
         damage: Why the end of the bag is missing; empty if it is whole.
+        units: Units of the messages; ``data`` is in rad and m.
+        remarks: What the sizes of the numbers told.
     """
 
     data: Measurements
@@ -72,6 +85,8 @@ class BagMeasurements:
     streams: tuple[StreamCount, ...]
     frame_id: str
     damage: str
+    units: Units = SI
+    remarks: tuple[str, ...] = ()
 
     @property
     def stamps(self) -> IntArray:
@@ -81,6 +96,9 @@ class BagMeasurements:
     def describe(self) -> list[str]:
         """Lines for people: rows, rejections by reason with an example, messages by topic, damage."""
         lines = [f"{len(self.standstills)} standstills in frame {self.frame_id or '(not named)'}"]
+        if self.units != SI:
+            lines.append(f"messages in {self.units.length} and {self.units.angle}")
+        lines += list(self.remarks)
         lines += _reasons(self.rejections) + [s.describe() for s in self.streams]
         return lines + ([f"damaged: {self.damage}"] if self.damage else [])
 
@@ -94,6 +112,7 @@ def read_bag(
     sigma: float = 0.0,
     repeatability: float = 0.0,
     accept_damaged: bool = False,
+    units: Units | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> BagMeasurements:
     """Read a bag; the joints come in the robot's order, targets in that of the topics.
@@ -106,6 +125,7 @@ def read_bag(
         sigma: Standard deviation of one coordinate of one sample [m]; 0: from the samples' scatter.
         repeatability: Standard deviation that averaging does not reduce [m].
         accept_damaged: Take what could be read of a damaged bag; it says so in ``damage``.
+        units: Units of the messages; what is not stated is told by the sizes of the numbers.
         progress: Called with the share done and a text now and then.
 
     Raises:
@@ -117,7 +137,8 @@ def read_bag(
     check_number("sigma", sigma, low=0, high=1, unit="m")
     check_number("repeatability", repeatability, low=0, high=1, unit="m")
     with open_bag(path, topics) as recording:
-        bag = _BagIntake(path, robot.joint_names, topics, settings)
+        units, remarks = _units(recording, robot, units or UNSAID)
+        bag = _BagIntake(path, robot, topics, settings, units)
         damage = bag.drain(recording, progress)
     streams, standstills = tuple(bag.intake.streams), tuple(bag.standstills)
     if damage and not accept_damaged:
@@ -131,7 +152,33 @@ def read_bag(
         raise _no_standstill(path, bag.rejections, streams[0], settings)
     q, points = np.array([s.joints for s in standstills]), np.array([s.points for s in standstills])
     data = Measurements(robot.joint_names, q, points, mean_std(standstills, sigma, repeatability))
-    return BagMeasurements(data, standstills, tuple(bag.rejections), streams, bag.intake.frame, damage)
+    rejections = tuple(bag.rejections)
+    return BagMeasurements(data, standstills, rejections, streams, bag.intake.frame, damage, units, remarks)
+
+
+def _units(recording: Recording, robot: Robot, stated: Units) -> tuple[Units, tuple[str, ...]]:
+    """The units of the messages, and what told those that are not stated."""
+    if stated.length and stated.angle:
+        return stated, ()
+    joints, points = [np.zeros(len(robot.joint_names))], []
+    number = {name: j for j, name in enumerate(robot.joint_names)}
+    with suppress(BrokenStorage):
+        for stream, data in islice(recording.messages(), LOOKED_AT):
+            message = recording.decode(stream, data)
+            if stream:
+                row = np.full((len(recording.names) - 1, 3), np.nan)
+                row[stream - 1] = message.point.x, message.point.y, message.point.z
+                points.append(row)
+            else:
+                q = np.zeros(len(number))
+                for name, value in zip(message.name, message.position, strict=False):
+                    if name in number:
+                        q[number[name]] = value
+                joints.append(q)
+    angle, why = angles_by_size(robot, np.nan_to_num(joints), robot.joint_is_revolute)
+    metre, how = lengths_by_size(robot, np.array(points).reshape(len(points), len(recording.names) - 1, 3))
+    remarks = [*(() if stated.angle else why), *(() if stated.length else how)]
+    return Units(stated.length or metre, stated.angle or angle), tuple(remarks)
 
 
 # ── what makes a bag unusable ────────────────────────────────────────────────────────────────────────
@@ -196,10 +243,13 @@ class _BagIntake:
     """
 
     def __init__(
-        self, path: str | Path, joint_names: tuple[str, ...], topics: BagTopics, settings: StandstillSettings
+        self, path: str | Path, robot: Robot, topics: BagTopics, settings: StandstillSettings, units: Units
     ) -> None:
         self.path = path
-        self.intake = Intake(joint_names, topics.names[0], topics.names[1:], settings)
+        self.intake = Intake(robot.joint_names, topics.names[0], topics.names[1:], settings)
+        self._metre = LENGTHS[units.length]
+        factors = np.where(robot.joint_is_revolute, ANGLES[units.angle], self._metre).tolist()
+        self._factors = {n: f for n, f in zip(robot.joint_names, factors, strict=True) if f != 1.0}
         self.standstills: list[Standstill] = []
         self.rejections: list[Rejection] = []
         assert self.intake.detector is not None
@@ -238,8 +288,14 @@ class _BagIntake:
             return
         if stream:
             self._check_frame(message.header.frame_id)
+            if self._metre != 1.0:
+                x, y, z = (self._metre * v for v in (message.point.x, message.point.y, message.point.z))
+                message = SimpleNamespace(header=message.header, point=SimpleNamespace(x=x, y=y, z=z))
             self._sort(self.intake.point(stream - 1, message))
             return
+        if self._factors and len(message.name) == len(message.position):
+            q = [v * self._factors.get(n, 1.0) for n, v in zip(message.name, message.position, strict=True)]
+            message = SimpleNamespace(header=message.header, name=message.name, position=q)
         with suppress(InputError):  # counted with its reason
             self._sort(self.intake.joints(message))
 
@@ -261,31 +317,6 @@ class _BagIntake:
 # ── messages out of a recording ──────────────────────────────────────────────────────────────────────
 
 
-@dataclass(frozen=True)
-class BagTopics:
-    """Where the messages are; a leading slash may be left out.
-
-    Attributes:
-        joints: Topic of sensor_msgs/JointState.
-        points: Topics of geometry_msgs/PointStamped, one per target, in the order of the targets.
-    """
-
-    joints: str = "joint_states"
-    points: tuple[str, ...] = ("tracker/point",)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "points", tuple(self.points))
-        names = self.names
-        if len(names) < 2 or "/" in names or len(set(names)) != len(names):
-            got = ", ".join(map(repr, (self.joints, *self.points)))
-            raise InputError("topics", got, "a topic of joints and one per target, each once")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All topics as a bag names them, that of the joints first."""
-        return tuple("/" + name.strip().strip("/") for name in (self.joints, *self.points))
-
-
 class BrokenStorage(Exception):
     """Reading stopped before the end; the text says why."""
 
@@ -297,11 +328,13 @@ class Recording:
     Attributes:
         names: The topics wanted, as in the bag; their positions are the numbers of the streams.
         promised: Messages of each topic, as the bag's own index says.
+        kinds: Types of their messages.
         unread: What the bag holds but no reader gets at, in words; empty if there is nothing.
     """
 
     names: tuple[str, ...]
     promised: tuple[int, ...]
+    kinds: tuple[str, ...]
     unread: str
     _readers: tuple[Any, ...]
     _types: Any
@@ -325,15 +358,20 @@ class Recording:
                 yield self.names.index(connection.topic), data
 
     def decode(self, stream: int, data: bytes) -> Any:
-        """The message as an object with the fields of its type.
+        """The message as an object with the fields of JointState or PointStamped.
 
         Raises:
             BrokenStorage: These bytes are no such message.
         """
         try:
-            return self._types.deserialize_cdr(data, POINT if stream else JOINT_STATE)
+            message = self._types.deserialize_cdr(data, self.kinds[stream])
         except Exception as error:
             raise BrokenStorage(reason(error)) from None
+        if not stream or self.kinds[stream] == POINT:
+            return message
+        pose = self.kinds[stream] == POINTS[1]
+        point = message.pose.position if pose else message.transform.translation
+        return SimpleNamespace(header=message.header, point=point)
 
 
 @contextmanager
@@ -352,17 +390,11 @@ def open_bag(path: str | Path, topics: BagTopics) -> Iterator[Recording]:
                 readers.append(stack.enter_context(reader_class(part)))
             except Exception as error:
                 raise FileFormatError(part, "bag", reason(error), WHAT, REPAIR) from None
-        _check_topics(path, readers, topics.names)
+        kinds = _kinds(path, readers, topics.names)
         promised = tuple(
             sum(c.msgcount for r in readers for c in r.connections if c.topic == name) for name in topics.names
         )
-        yield Recording(topics.names, promised, _write_ahead(path), tuple(readers), types)
-
-
-def is_bag(path: str | Path) -> bool:
-    """Whether ``path`` is to be read as a bag rather than as text: a folder, or a storage file by its name."""
-    place = user_path(path)
-    return place.is_dir() or place.suffix in STORAGE or place.name == "metadata.yaml"
+        yield Recording(topics.names, promised, kinds, _write_ahead(path), tuple(readers), types)
 
 
 def storage_parts(path: str | Path) -> list[Path]:
@@ -408,21 +440,24 @@ def _rosbags() -> tuple[Any, Any]:
     return Reader, get_typestore(Stores.ROS2_JAZZY)
 
 
-def _check_topics(path: str | Path, readers: list[Any], names: tuple[str, ...]) -> None:
+def _kinds(path: str | Path, readers: list[Any], names: tuple[str, ...]) -> tuple[str, ...]:
+    """The type of each topic's messages, which has to be one that holds what is needed."""
     types_of: dict[str, set[str]] = {}
     for connection in (c for r in readers for c in r.connections):
         types_of.setdefault(connection.topic, set()).add(connection.msgtype)
     described = _list([f"{t} ({', '.join(sorted(types_of[t]))})" for t in sorted(types_of)])
     for stream, name in enumerate(names):
-        wanted, option = (POINT, "--point-topic") if stream else (JOINT_STATE, "--joint-topic")
-        fitting = [t for t in sorted(types_of) if types_of[t] == {wanted}]
+        valid, option = (POINTS, "--point-topic") if stream else ((JOINT_STATE,), "--joint-topic")
+        fitting = [t for t in sorted(types_of) if len(types_of[t]) == 1 and types_of[t] <= {*valid}]
+        wanted = " or ".join(valid)
         close = (get_close_matches(name, fitting, n=1, cutoff=0.3) or fitting)[:1]
         advice = f"is it {option} {close[0]}?" if close else f"record a topic of type {wanted}"
         if name not in types_of:
             got = f"a bag with {described}"
             raise FileFormatError(path, f"topic {name}", got, f"messages of {wanted}", advice)
-        if types_of[name] != {wanted}:
+        if name not in fitting:
             raise FileFormatError(path, f"topic {name}", ", ".join(sorted(types_of[name])), wanted, advice)
+    return tuple(next(iter(types_of[name])) for name in names)
 
 
 def _write_ahead(path: str | Path) -> str:

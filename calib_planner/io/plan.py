@@ -29,7 +29,7 @@ import numpy as np
 import yaml
 
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.io.csv import REPETITIONS
+from calib_planner.io.columns import REPETITIONS
 from calib_planner.io.robots import URDF_SUFFIXES
 from calib_planner.io.text import write_text
 from calib_planner.io.urdf import read_speed_limits

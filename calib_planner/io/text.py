@@ -4,12 +4,37 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib_planner.errors import FileFormatError, InputError
 
 MAX_BYTES = 50_000_000
 """Larger files are refused: a plan or a day's measurements is far below a megabyte."""
+
+
+@dataclass(frozen=True, eq=False)
+class RawLines:
+    """A file before anybody looked at what its lines mean.
+
+    Attributes:
+        path: The file.
+        kind: What kind of file it is, with the part of it that was read, for people.
+        texts: The lines, blank ones among them.
+        word: What a position in ``texts``, from 1, counts in the file: ``line``, ``row`` or ``entry``.
+        separator: What parts the cells, where the kind of file decides that; empty for text.
+        units: Column name → unit as written, where the file says that apart from the names.
+        first: Number of the first text.
+    """
+
+    path: str
+    kind: str
+    texts: Sequence[str] = field(repr=False)
+    word: str = "line"
+    separator: str = ""
+    units: dict[str, str] = field(default_factory=dict)
+    first: int = 1
 
 
 def user_path(path: str | Path) -> Path:
@@ -92,6 +117,43 @@ def decode(path: str | Path, what: str, data: bytes, encoding: str = "utf-8") ->
         line = data.count(b"\n", 0, error.start) + 1
         got = f"byte 0x{data[error.start]:02x} in line {line} ({error.reason})"
         raise FileFormatError(path, "file", got, what, "save it as UTF-8 text") from None
+
+
+def decode_any(path: str | Path, what: str, data: bytes) -> tuple[str, str]:
+    """``data`` as text in whatever encoding tables come, and the encoding's name.
+
+    A byte order mark decides; else every second byte being zero tells UTF-16; else it is UTF-8, and if it is
+    not, the Windows code page of western languages, in which spreadsheets write ° and µ.
+
+    Raises:
+        FileFormatError: Bytes that are no text.
+    """
+    sample = data[:4096]
+    odd, even = sample[1::2].count(0), sample[0::2].count(0)
+    half = len(sample) // 2
+    encoding = "utf-8-sig"
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encoding = "utf-16"
+    elif half and max(odd, even) > 0.7 * half and min(odd, even) < 0.1 * half:
+        encoding = "utf-16-le" if odd > even else "utf-16-be"
+    if encoding == "utf-8-sig":
+        if b"\0" in data:
+            line = data.count(b"\n", 0, data.index(b"\0")) + 1
+            raise FileFormatError(path, f"line {line}", "a NUL character", what, "save it as text")
+        try:
+            return data.decode(encoding), "UTF-8"
+        except UnicodeDecodeError:
+            encoding = "cp1252"
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        got = f"byte 0x{data[error.start]:02x} in line {line} ({error.reason})"
+        raise FileFormatError(path, "file", got, what, "save it as UTF-8 text") from None
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise FileFormatError(path, f"line {line}", "a NUL character", what, "save it as text")
+    return text, {"cp1252": "Windows-1252"}.get(encoding, "UTF-16")
 
 
 def write_text(path: str | Path, text: str, field: str = "output") -> None:

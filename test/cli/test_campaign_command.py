@@ -11,7 +11,7 @@ import pytest
 
 from calib_planner import Robot
 from calib_planner.cli import main
-from calib_planner.io import read_estimate, read_measurements, read_plan_csv, write_measurements
+from calib_planner.io import read_data, read_estimate, read_plan_csv, write_measurements
 from calib_planner.measurements import Measurements
 from calib_planner.simulation import SimulatedCell, random_deviations
 
@@ -35,8 +35,8 @@ def test_simulated(tmp_path: Path, capsys: Any) -> None:
     assert found["achieved_per_test_pose"][0] < 120e-6
     assert [r["number"] for r in found["rounds"]] == list(range(len(found["rounds"])))
     robot = Robot.load("planar_2r")
-    fit = read_measurements(tmp_path / "new" / "measurements.csv", robot).data
-    held_out = read_measurements(tmp_path / "new" / "validation.csv", robot).data
+    fit = read_data(tmp_path / "new" / "measurements.csv", robot).data
+    held_out = read_data(tmp_path / "new" / "validation.csv", robot).data
     assert len(fit) + len(held_out) == found["spent"] and len(held_out) == 6
     np.testing.assert_array_equal(fit.p, found["measurements"]["points"])
     values = [p["value"] for p in found["estimate"]["parameters"]]

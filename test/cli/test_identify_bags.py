@@ -49,8 +49,6 @@ def test_options_of_bags_need_one(points: Path, bag: Path, capsys: pytest.Captur
     for more in (("--joint-topic", "x"), ("--settle", "0.1"), ("--accept-damaged",)):
         status, line = fails(capsys, *words, points, *more)
         assert status == 2 and more[0] in line and "a bag among --data or --validate" in line
-    status, line = fails(capsys, *words, bag, "--millimetres")
-    assert status == 2 and "--millimetres" in line and "REP-103" in line
     status, line = fails(capsys, *words, bag)
     assert status == 1 and "joint_states" in line and "/arm/joints" in line
     status, line = fails(capsys, *words, bag, "--duration", "-1")

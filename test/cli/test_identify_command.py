@@ -205,7 +205,7 @@ def test_an_instrument_alike_in_all_directions_is_a_sigma(run: Run, points: Path
 
 
 def test_millimetres(run: Run, points: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Points and std of every file; without the option they are refused in one line that names it."""
+    """Points and std of every file; without the option they are recognised by their size, and it is said."""
     data = small_data()
     assert data.std is not None
     wide = Measurements(data.joint_names, data.q, 1e3 * data.p, 1e3 * np.asarray(data.std))
@@ -220,8 +220,10 @@ def test_millimetres(run: Run, points: Path, tmp_path: Path, capsys: pytest.Capt
     np.testing.assert_allclose(values(found, "std"), values(expected, "std"), rtol=1e-9)
     assert found["validation"]["rms"] == pytest.approx(expected["validation"]["rms"], rel=1e-9)
     for files in (("--data", path), ("--data", points, "--validate", test)):
-        status, line = fails(capsys, *words, *files)
-        assert status == 1 and str(files[-1]) in line and "--millimetres" in line
+        _, err = run(*words, *files, shown=True)
+        assert f"{files[-1]}: text with comma, 12 rows;" in err and "lengths in mm (by their size)" in err
+    status, line = fails(capsys, *words, "--data", points, "--millimetres")
+    assert status == 1 and str(points) in line and "leave out --millimetres" in line
 
 
 def test_several_files_are_one(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -185,6 +185,7 @@ def needs_real(word: str) -> bool:
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
 COMMANDS = (
     "init",
+    "import",
     "plan",
     "sheet",
     "program",

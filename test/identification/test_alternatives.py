@@ -418,12 +418,12 @@ def test_a_prior_that_is_too_narrow_is_named() -> None:
 
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the measured robots are not here")
 def test_a_measured_robot_has_no_gross_mistake_until_it_is_made() -> None:
-    from calib_planner.io import read_measurements
+    from calib_planner.io import read_data
 
     folder = SHARED_DATA / "irb120_tracker"
     robot = Robot.load(str(folder / "irb120.urdf")).with_targets(np.zeros((3, 3)))
     robot = robot.with_parameters("full", ("base", "tool"))
-    data = read_measurements(folder / "calibration.csv", robot).data
+    data = read_data(folder / "calibration.csv", robot).data
     assert explain_gross(robot, data) is None
     for mistake in ("both", "sign", "couple", "next"):
         change, expected = GROSS[mistake]

@@ -10,7 +10,7 @@ from robots import SHARED_DATA, mixed, random_configurations, repeats
 from calib_planner import IdentificationProblem, Measurements, NotEnoughDataError, Robot, identify
 from calib_planner.error_model import ErrorModel
 from calib_planner.identification import estimation
-from calib_planner.io import read_measurements
+from calib_planner.io import read_data
 from calib_planner.simulation import SimulatedCell, random_deviations
 
 ROBOTS = {
@@ -101,7 +101,7 @@ def test_subsets_of_a_measured_robot_are_never_refused() -> None:
         pytest.skip("no measured data beside the repository")
     robot = Robot.load(folder / "ur10.urdf").with_targets(np.zeros((1, 3)))
     robot = robot.with_parameters("full", ("base", "tool"))
-    data = read_measurements(folder / "random_poses.csv", robot).data
+    data = read_data(folder / "random_poses.csv", robot).data
     for seed in range(repeats(4, 40)):
         rows = np.random.default_rng(seed).choice(len(data), (15, 40, 60)[seed % 3], replace=False)
         try:

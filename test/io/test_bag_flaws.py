@@ -37,9 +37,9 @@ FLAWS: dict[str, tuple[dict, BagTopics, list[str]]] = {
         ["topic /tracker/point", "/leica/point (geometry_msgs/msg/PointStamped)", "--point-topic /leica/point?"],
     ),
     "other type": (
-        {"said": SAID, "types": ("sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped")},
+        {"said": SAID, "types": ("sensor_msgs/msg/JointState", "geometry_msgs/msg/Vector3Stamped")},
         BagTopics(),
-        ["topic /tracker/point", "got geometry_msgs/msg/PoseStamped", "record a topic of type"],
+        ["topic /tracker/point", "got geometry_msgs/msg/Vector3Stamped", "record a topic of type"],
     ),
     "joints where points are": (
         {"said": SAID},

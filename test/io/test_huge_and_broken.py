@@ -15,7 +15,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from calib_planner import CalibPlannerError, FileFormatError, Robot
-from calib_planner.io import csv, read_configurations, read_measurements, read_plan_csv, text
+from calib_planner.io import Reading, read_configurations, read_data, read_plan_csv, table, text
+from calib_planner.units import SI
 
 PLANAR = Robot.load("planar_2r")
 HEADER = "q1,q2,x1,y1,z1\n"
@@ -29,7 +30,7 @@ def put(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def refused(path: Path, read: Callable = read_measurements) -> str:
+def refused(path: Path, read: Callable = read_data) -> str:
     """The error's text, which is one line, not long, printable and names the file."""
     with pytest.raises(FileFormatError) as caught:
         read(path, PLANAR)
@@ -39,25 +40,16 @@ def refused(path: Path, read: Callable = read_measurements) -> str:
 
 
 BROKEN: dict[str, tuple[str | bytes, list[str]]] = {
-    "UTF-16 with mark": (GOOD.encode("utf-16"), ["byte 0xff in line 1", "save it as UTF-8"]),
-    "UTF-16 without mark": (GOOD.encode("utf-16-le"), ["line 1", "NUL", "not UTF-16"]),
-    "Latin-1 bytes": ((GOOD + "# 20 °C\n").encode("latin-1"), ["byte 0xb0 in line 3", "save it as UTF-8"]),
     "NUL in a cell": (GOOD + "0.1,\0,1,2,3\n", ["line 3", "a NUL character"]),
     "NULs at the end": (GOOD + "\0" * 4096, ["line 3", "a NUL character"]),
-    "a spreadsheet": (b"PK\x03\x04\x14\x00\x06\x00\x08\x00\x00\x00!\x00\xb5U0#", ["save it as UTF-8"]),
-    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR", ["byte 0x89 in line 1"]),
-    "HTML": ("<!DOCTYPE html>\n<html></html>\n", ["no column q1, q2 among <!DOCTYPE html>"]),
-    "JSON": ('{"q1": [1, 2],\n"q2": [3, 4]}\n', ["text of line 2"]),
-    "YAML": ("joints: 2\nrows: 3\n", ["no column q1, q2 among joints: 2"]),
+    "a spreadsheet": (b"PK\x03\x04\x14\x00\x06\x00\x08\x00\x00\x00!\x00\xb5U0#", ["a ZIP archive", "unpack it"]),
+    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR", ["a PNG picture", "export the table as CSV"]),
+    "HTML": ("<!DOCTYPE html>\n<html></html>\n", ["a web page (HTML)", "download the table"]),
+    "JSON": ('{"q1": [1, 2],\n"q2": [3, 4]}\n', ["no column x1, y1, z1 among q1, q2"]),
+    "YAML": ("joints: 2\nrows: 3\n", ["no header, and 2 columns", 'state --columns "q1 q2 x1 y1 z1"']),
     "escape codes": ("\x1b[31mq1,q2,x1,y1,z1\n1,2,3,4,5\n", ["no column q1", "\\x1b[31mq1"]),
     "decimal commas": ("q1,q2,x1,y1,z1\n0,1,-0,2,1,5,0,25,0,001\n", ["line 2", "10 cells", "use decimal points"]),
-    "decimal commas, semicolons": (
-        "q1;q2;x1;y1;z1\n0,1;-0,2;1,5;0,25;0,001\n",
-        ["line 2, column q1", "'0,1'", "use a decimal point"],
-    ),
-    "decimal commas, tabs": ("q1\tq2\tx1\ty1\tz1\n0,1\t0\t1\t2\t3\n", ["column q1", "use a decimal point"]),
     "thousands": ("q1;q2;x1;y1;z1\n0;0;1.500,25;0;0\n", ["column x1", "'1.500,25'", "use a decimal point"]),
-    "quoted decimal comma": ('q1,q2,x1,y1,z1\n0,0,"1,5",0,0\n', ["column x1", "'1,5'", "use a decimal point"]),
     "quote not closed": (HEADER + '0,0,1,0,"0\n', ["text of line 2"]),
     "quote over two lines": (HEADER + '0,0,1,0,"0\n0"\n', ["text of line 2", "end on their line"]),
     "columns twice": ("q1,q2,x1,y1,z1,x1,z1\n0,0,1,2,3,4,5\n", ["x1, z1 twice", "each column name once"]),
@@ -78,8 +70,6 @@ BROKEN: dict[str, tuple[str | bytes, list[str]]] = {
     "huge quoted cell": (HEADER + '0,"' + "a" * 200_000 + '",1,2,3\n', ["line 2", "field limit"]),
     "huge name": ("q1,q2,x1,y1," + "z" * 200_000 + "\n0,0,0,0,0\n", ["no column z1", "zzz"]),
     "cut off in a row": (GOOD + "0.1,-0.2,1.", ["line 3", "3 cells"]),
-    "joints called otherwise": ("joint_1,joint_2,x1,y1,z1\n0,0,1,2,3\n", ["no column q1, q2", "joint_1"]),
-    "no header": (ROW + ROW, ["no column q1, q2 among 0.1, -0.2"]),
     "many columns": (
         ",".join(f"c{i}" for i in range(100_000)) + "\n" + ",".join("1" * 100_000) + "\n",
         ["100000 columns", "at most 10000"],
@@ -97,7 +87,6 @@ BROKEN: dict[str, tuple[str | bytes, list[str]]] = {
         "q1,q2," + ",".join(f"{a}{t}" for t in range(1, 3001) for a in "xyz")[:-6] + "\n0\n",
         ["cells, one per column"],
     ),
-    "targets numbered from 0": ("q1,q2,x0,y0,z0\n0,0,1,2,3\n", ["no column x1, y1, z1"]),
     "a target far up": ("q1,q2,x9999,y9999,z9999\n0,0,1,2,3\n", ["no column x1, y1, z1"]),
 }
 
@@ -120,12 +109,42 @@ def test_what_is_wrong_is_said(tmp_path: Path, case: str) -> None:
         "q1,q2,x1,y1,z1,größe_mm,температура\n0.1,-0.2,1.5,0.25,1e-3,1_0,²\n",
         "q1,q2,x1,y1,z1,,\n0.1,-0.2,1.5,0.25,1e-3,,\n,,,,,,\n",
         "z1,note,y1,q2,x1,q1\n1e-3,\u2028\x0b,0.25,-0.2,1.5,0.1\n",
+        GOOD.encode("utf-16"),
+        GOOD.encode("utf-16-le"),
+        GOOD.encode("utf-16-be"),
+        (GOOD + "# 20 °C\n").encode("latin-1"),
+        "q1;q2;x1;y1;z1\n0,1;-0,2;1,5;0,25;0,001\n",
+        "q1\tq2\tx1\ty1\tz1\n0,1\t-0,2\t1,5\t,25\t1e-3\n",
+        'q1,q2,x1,y1,z1\n"0,1","-0,2","1,5","0,25","0,001"\n',
+        GOOD.replace("q1,q2", "joint_1,joint_2"),
+        GOOD.replace("x1,y1,z1", "x0,y0,z0"),
+        ROW,
         "q1,q2,x1,y1,z1\n +.1 ,\t-2E-1,01.5, 0.25 ,\u00a01e-3\n",
     ],
-    ids=["UTF-8", "CR", "CRLF", "semicolons", "quotes", "letters", "trailing", "odd breaks", "spellings"],
+    ids=[
+        "UTF-8",
+        "CR",
+        "CRLF",
+        "semicolons",
+        "quotes",
+        "letters",
+        "trailing",
+        "odd breaks",
+        "UTF-16",
+        "UTF-16-LE",
+        "UTF-16-BE",
+        "Latin-1",
+        "decimal commas",
+        "with tabs",
+        "quoted",
+        "by number",
+        "from 0",
+        "no header",
+        "spellings",
+    ],
 )
-def test_what_is_odd_but_clear_is_read(tmp_path: Path, content: str) -> None:
-    data = read_measurements(put(tmp_path, content), PLANAR).data
+def test_what_is_odd_but_clear_is_read(tmp_path: Path, content: str | bytes) -> None:
+    data = read_data(put(tmp_path, content), PLANAR).data
     assert data.q.tolist() == [[0.1, -0.2]] and data.p.tolist() == [[[1.5, 0.25, 1e-3]]]
 
 
@@ -136,12 +155,12 @@ def test_line_numbers_are_the_editors(tmp_path: Path) -> None:
 
 def test_millimetres_are_read_as_they_stand(tmp_path: Path) -> None:
     """No file reader's business: a robot may be large. What identifies may suspect it."""
-    data = read_measurements(put(tmp_path, HEADER + "0,0,1800.0,0,0\n"), PLANAR).data
+    data = read_data(put(tmp_path, HEADER + "0,0,1800.0,0,0\n"), PLANAR).data
     assert data.p[0, 0, 0] == 1800.0
 
 
 @pytest.mark.parametrize("read", [read_configurations, read_plan_csv])
-@pytest.mark.parametrize("case", ["UTF-16 without mark", "decimal commas, semicolons", "inf", "many columns"])
+@pytest.mark.parametrize("case", ["NUL in a cell", "decimal commas", "inf", "many columns"])
 def test_configurations_are_read_the_same_way(tmp_path: Path, read: Callable, case: str) -> None:
     content, words = BROKEN[case]
     message = refused(put(tmp_path, content), read)
@@ -149,24 +168,24 @@ def test_configurations_are_read_the_same_way(tmp_path: Path, read: Callable, ca
 
 
 def test_many_rows_are_all_there_and_in_order(tmp_path: Path) -> None:
-    values = np.random.default_rng(0).standard_normal((3 * csv.BLOCK + 7, 5))
+    values = np.random.default_rng(0).standard_normal((3 * table.BLOCK + 7, 5))
     lines = [",".join(map(repr, row)) for row in values.tolist()]
-    holes = [5, csv.BLOCK - 1, csv.BLOCK, len(lines) - 1]
+    holes = [5, table.BLOCK - 1, table.BLOCK, len(lines) - 1]
     for i in holes:
         lines[i] = ",".join([*lines[i].split(",")[:2], "", "", ""])
         values[i, 2:] = np.nan
     lines[100] = '"' + lines[100].replace(",", '","') + '"'
-    data = read_measurements(put(tmp_path, HEADER + "\n".join(lines)), PLANAR).data
+    data = read_data(put(tmp_path, HEADER + "\n".join(lines)), PLANAR).data
     np.testing.assert_array_equal(data.q, values[:, :2])
     np.testing.assert_array_equal(data.p[:, 0], values[:, 2:])
     bad = lines.copy()
-    bad[2 * csv.BLOCK] = "0,0,1,2,x"
+    bad[2 * table.BLOCK] = "0,0,1,2,x"
     message = refused(put(tmp_path, HEADER + "\n".join(bad)))
-    assert f"line {2 * csv.BLOCK + 2}, column z1" in message
+    assert f"line {2 * table.BLOCK + 2}, column z1" in message
 
 
 def test_too_many_rows_are_counted(tmp_path: Path) -> None:
-    path = put(tmp_path, HEADER + "0,0,0,0,0\n" * (csv.MAX_ROWS + 1))
+    path = put(tmp_path, HEADER + "0,0,0,0,0\n" * (table.MAX_ROWS + 1))
     assert "at most 1000000, got 1000001" in refused(path)
 
 
@@ -211,13 +230,13 @@ def survives(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.csv"
         path.write_bytes(content)
-        for read in (read_measurements, read_configurations, read_plan_csv):
+        for read in (read_data, read_configurations, read_plan_csv):
             try:
                 found = read(path, PLANAR)
             except CalibPlannerError as error:
                 assert "\n" not in str(error) and len(str(error)) < 2500
                 continue
-            q = found.data.q if read is read_measurements else found[0] if read is read_plan_csv else found
+            q = found.data.q if read is read_data else found[0] if read is read_plan_csv else found
             assert len(q) and np.isfinite(q).all()
 
 
@@ -237,5 +256,5 @@ def test_any_order_and_spelling_of_the_columns_gives_the_same(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.csv"
         path.write_bytes(end.join(rows).encode())
-        data = read_measurements(path, PLANAR).data
+        data = read_data(path, PLANAR, Reading(units=SI)).data
     assert [*data.q[0], *data.p[0, 0]] == values

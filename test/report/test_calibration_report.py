@@ -18,7 +18,7 @@ from robots import SHARED_DATA, random_configurations
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.error_model import MEANINGS, ErrorModel
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.io import read_measurements
+from calib_planner.io import read_data
 from calib_planner.report import provenance, write_report
 from calib_planner.report.calibration import calibration_report, sha256_of
 from calib_planner.report.charts import MOST_DOTS, drawn_points, joint_residuals
@@ -312,7 +312,7 @@ def test_a_measured_robot() -> None:
         .with_targets(np.zeros((3, 3)))
         .with_parameters("full", ("base", "tool"))
     )
-    problem = IdentificationProblem(robot, read_measurements(folder / "calibration.csv", robot).data)
+    problem = IdentificationProblem(robot, read_data(folder / "calibration.csv", robot).data)
     estimate = identify(problem)
     made = provenance([("robot", folder / "irb120.urdf"), ("data", folder / "calibration.csv")])
     page = Page(report_page(calibration_report(problem, estimate, made)))

@@ -20,7 +20,7 @@ from geometry_msgs.msg import Point
 from rclpy.parameter import Parameter
 
 from calib_planner import Robot
-from calib_planner.io import open_campaign, read_estimate, read_measurements
+from calib_planner.io import open_campaign, read_data, read_estimate
 from calib_planner.io.store import CAMPAIGN_FILE as FILE
 from calib_planner.io.store import JOURNAL
 from calib_planner.ros import campaign as campaign_measuring
@@ -85,7 +85,7 @@ def test_a_campaign_with_simulator_and_identifier(bench: Bench, tmp_path: Path) 
         f"{ids['estimate']}.yaml",
     }
     robot = Robot.load("planar_2r")
-    assert len(read_measurements(tmp_path / f"{ids['measurements']}.csv", robot).data) == done.measured
+    assert len(read_data(tmp_path / f"{ids['measurements']}.csv", robot).data) == done.measured
     saved = read_estimate(tmp_path / f"{ids['estimate']}.yaml")
     np.testing.assert_array_equal(saved.deviations, found.deviations)
 
