@@ -45,9 +45,10 @@ from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError
 from calib_planner.planning.criteria import Criterion, is_sharp, sharpened
 from calib_planner.planning.extended import ExtendedModel, LinearisedExtension
-from calib_planner.planning.feasibility import Feasibility
+from calib_planner.planning.feasibility import Feasibility, PlanWalls
 from calib_planner.planning.information import Model
 from calib_planner.planning.search.descent import Descent, climb, descend
+from calib_planner.planning.search.interior import descend_inside
 
 SPREAD = 256
 DRAWN_FIRST = 400
@@ -308,7 +309,7 @@ def _from(
     assert design.seen is not None
     peaks = maximise_sensitivity(replace(problem, model=design.seen), design.gradient, starts)
     top = max(float(heights_of(design, starts).max()), float(np.exp(-peaks.value.min())))
-    if problem.feasibility.constraints:  # along the edge of what is allowed descents end too early
+    if problem.feasibility.masks:  # along an edge without a margin descents end too early
         best = peaks.x[np.argsort(peaks.value)[:STARTS]]
         top = max(top, climb(problem.feasibility, lambda q: heights_of(design, q), best, rng)[1].max())
     return replace(design, bound=max(design.bound, design.ground + problem.visits * top))
@@ -334,21 +335,27 @@ def _probes(
     return np.concatenate([known, random[np.argsort(-height)[:14]]])
 
 
+EDGE = (1e-2, 1e-4)
+"""First and last pressure on the edges of what is allowed: the last one hides 1e-4 of d per active margin."""
+
+
 def maximise_sensitivity(problem: DesignProblem, gradient: FloatArray, starts: FloatArray) -> Descent:
     """Local maxima of d(q) over the feasible configurations, as minima of −log d, from ``starts`` (N, joints)."""
-    low, high = problem.model.robot.joint_limits.T
-    constrained = bool(problem.feasibility.constraints)
+    feasibility = problem.feasibility
+    low, high = feasibility.limits.T
 
     def objective(q: FloatArray) -> tuple[FloatArray, FloatArray]:
         info = problem.model.linearised(q)
         d = np.einsum("nip,nip->n", info.jacobian @ gradient, info.weighted)
         d = np.maximum(d, 1e-300)
-        value = np.where(problem.feasibility.mask(q), -np.log(d), np.inf) if constrained else -np.log(d)
-        return value, info.gradient(-gradient / d[:, None, None])
+        return -np.log(d), info.gradient(-gradient / d[:, None, None])
 
-    if isinstance(problem.model, ExtendedModel):
-        return descend(objective, starts, low, high, iterations=20, tolerance=1e-3)
-    return descend(objective, starts, low, high, iterations=40, tolerance=1e-4)
+    iterations, tolerance = (20, 1e-3) if isinstance(problem.model, ExtendedModel) else (40, 1e-4)
+    if not feasibility.constraints:
+        return descend(objective, starts, low, high, iterations=iterations, tolerance=tolerance)
+    return descend_inside(
+        objective, PlanWalls(feasibility, 1), starts, low, high, iterations=20, tolerance=1e-3, pressures=EDGE
+    )
 
 
 def _normalised(w: FloatArray) -> FloatArray:

@@ -1,7 +1,9 @@
-"""Which configurations may be measured at all.
+"""Which configurations may be measured at all, and how far they are from the edge of what is allowed.
 
-A constraint has a name and says, for a batch of configurations, which of them it allows. The joint limits are
-not among the constraints: every search keeps to them, and to the ``JointRange``s that narrow them, by itself.
+A constraint has a name and says, for a batch of configurations, which of them it allows. Most of them are
+inequalities m_k(q) ≥ 0 whose *margins* m_k the search can follow along the edge (``Walls``); a mere yes or no can
+only reject its steps. The joint limits are not among the constraints: every search keeps to them, and to the
+``JointRange``s that narrow them, by itself.
 """
 
 from __future__ import annotations
@@ -25,6 +27,13 @@ RARE = 0.01
 """Share of feasible configurations from which on rejection alone supplies as many as are wanted."""
 WITNESSES = 20_000
 """Random configurations that show which constraint empties the set."""
+DIFFERENCE = 1e-6
+"""Step of the differences that give normals [rad | m]: their error, about as much times the curvature of an edge,
+is far below what one step of a search bends away from its tangent."""
+CORRECTIONS = 2
+"""Newton's steps back over an edge; the second one takes what bends of the first."""
+RETREATS = (0.3,)
+"""Shares of an infeasible step that are tried in its place."""
 
 
 class Constraint(Protocol):
@@ -89,6 +98,28 @@ class Feasibility:
         mask = np.zeros(len(q), bool)
         mask[left] = True
         return mask
+
+    @property
+    def masks(self) -> tuple[Constraint, ...]:
+        """The constraints that say yes or no without a margin."""
+        return tuple(c for c in self.constraints if not isinstance(c, PostureConstraint | JointRange))
+
+    def margins(self, q: FloatArray) -> FloatArray:
+        """(N, joints) → (N, K) margins of all constraints that have some."""
+        seen = [c for c in self.constraints if isinstance(c, PostureConstraint)]
+        if not seen:
+            return np.zeros((len(q), 0))
+        posture = self.robot.posture(q)
+        return np.concatenate([c.margins(self.robot, posture) for c in seen], axis=1)
+
+    def measured(self, q: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+        """What is allowed of ``q`` (N, joints) within the limits (N,), and all margins (N, K) there are."""
+        margins = self.margins(q)
+        ok: NDArray[np.bool_] = np.asarray((margins >= 0).all(axis=1))
+        for constraint in self.masks:
+            if ok.any():
+                ok[ok] = constraint.allowed(self.robot, q[ok])
+        return ok, margins
 
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
         """(count, joints) random feasible configurations.
@@ -166,3 +197,94 @@ class Feasibility:
             )
         text = f"each allows some of {len(q)} {what}, all together none ({table}); loosen one"
         return InfeasibleError(names, text)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanWalls:
+    """The constraints on plans of ``size`` configurations, rows of D = size·joints coordinates.
+
+    They are the walls of ``search.interior``.
+    """
+
+    feasibility: Feasibility
+    size: int
+
+    @property
+    def joints(self) -> int:
+        """Coordinates of one configuration."""
+        return len(self.feasibility.robot.joint_names)
+
+    def margins(self, x: FloatArray) -> FloatArray:
+        """(rows, D) → (rows, size, K)."""
+        margins = self.feasibility.margins(x.reshape(len(x) * self.size, self.joints))
+        return margins.reshape(len(x), self.size, margins.shape[1])
+
+    def step(
+        self, old: FloatArray, new: FloatArray, margins: FloatArray, normals: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """What is feasible of steps from ``old``, which is, to ``new``, and the margins there.
+
+        A configuration that left the allowed set is brought back to it, by Newton's steps to the margins that the
+        tangent promised. Where that fails it goes some share of the step, or stays.
+
+        Args:
+            old, new: (rows, D).
+            margins: (rows, size, K) at ``old``.
+            normals: (rows, size, K, joints) their gradients there.
+
+        Returns:
+            (rows, D) points and (rows, size, K) margins.
+        """
+        start, wanted = old.reshape(-1, self.joints), new.reshape(-1, self.joints)
+        m = margins.reshape(len(start), margins.shape[2])
+        a = normals.reshape(*m.shape, self.joints)
+        q = wanted.copy()
+        ok, reached = self.feasibility.measured(q)
+        for share in (1.0, *RETREATS, 0.0):
+            outside = np.flatnonzero(~ok)
+            if not outside.size:
+                break
+            way = share * (wanted[outside] - start[outside])
+            q[outside] = start[outside] + way
+            if share < 1.0:
+                ok[outside], reached[outside] = self.feasibility.measured(q[outside])
+            if share:
+                promised = m[outside] + (a[outside] @ way[:, :, None])[:, :, 0]
+                self._bring_back(q, ok, reached, outside, promised, a[outside])
+        return q.reshape(new.shape), reached.reshape(margins.shape)
+
+    def _bring_back(
+        self,
+        q: FloatArray,
+        ok: NDArray[np.bool_],
+        margins: FloatArray,
+        rows: IntArray,
+        promised: FloatArray,
+        normals: FloatArray,
+    ) -> None:
+        """Move the infeasible ones of the configurations ``rows`` back over the edges they crossed, in place."""
+        low, high = self.feasibility.limits.T
+        lost = np.zeros(promised.shape, bool)
+        for _ in range(CORRECTIONS):
+            left = np.flatnonzero(~ok[rows] & (margins[rows] < 0).any(axis=1))
+            if not left.size:
+                return
+            which = rows[left]
+            lost[left] |= margins[which] < 0
+            # Least squares over the edges crossed, in the joints: as many unknowns as joints, however many edges.
+            a = normals[left] * lost[left][:, :, None]
+            lack = np.where(lost[left], promised[left] - margins[which], 0.0)
+            square = np.swapaxes(a, 1, 2) @ a
+            square += 1e-9 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(len(low))
+            back = np.linalg.solve(square + 1e-300 * np.eye(len(low)), np.swapaxes(a, 1, 2) @ lack[:, :, None])
+            q[which] = np.clip(q[which] + back[:, :, 0], low, high)
+            ok[which], margins[which] = self.feasibility.measured(q[which])
+
+    def normals(self, x: FloatArray) -> FloatArray:
+        """(rows, D) → (rows, size, K, joints) ∂m_k/∂q of every configuration, by differences."""
+        q = x.reshape(-1, self.joints)
+        moved = np.concatenate([q[None], q[None] + DIFFERENCE * np.eye(self.joints)[:, None]])
+        margins = self.feasibility.margins(moved.reshape(-1, self.joints))
+        margins = margins.reshape(self.joints + 1, len(q), margins.shape[1])
+        gradients = (margins[1:] - margins[0]) / DIFFERENCE
+        return gradients.transpose(1, 2, 0).reshape(len(x), self.size, margins.shape[2], self.joints)

@@ -18,7 +18,7 @@ from calib_planner.tracker import check_direction
 
 
 class PostureConstraint:
-    """A condition on where joints, tip and targets are; children define ``holds``."""
+    """A condition on where joints, tip and targets are; children define ``margins``."""
 
     def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
         """(N, joints) [rad | m] → (N,) bool."""
@@ -26,6 +26,13 @@ class PostureConstraint:
 
     def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
         """N postures of ``robot`` → (N,) bool."""
+        return np.asarray((self.margins(robot, posture) >= 0).all(axis=1))
+
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
+        """(N, K) by how much N postures of ``robot`` keep each of K inequalities; negative where they do not.
+
+        In the unit of the inequality, finite and smooth up to isolated kinks: the search follows the gradients.
+        """
         raise NotImplementedError
 
 
@@ -50,12 +57,14 @@ class WorkspaceBox(PostureConstraint):
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
 
-    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
         points = posture.targets
         if self.tip:
             points = np.concatenate([points, posture.tip_origin[:, None]], axis=1)
         low, high = np.asarray(self.low), np.asarray(self.high)
-        return np.asarray(((low <= points) & (points <= high)).all(axis=(1, 2)))
+        below, above = np.isfinite(low), np.isfinite(high)
+        both = np.concatenate([points[..., below] - low[below], high[above] - points[..., above]], axis=2)
+        return both.reshape(len(both), both.shape[1] * both.shape[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +92,7 @@ class MinimumHeight(PostureConstraint):
         object.__setattr__(self, "height", check_number("height", self.height, unit="m"))
         object.__setattr__(self, "up", check_direction("up", self.up))
 
-    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
         up = np.asarray(self.up)
         origins = np.concatenate([posture.joint_origins, posture.tip_origin[:, None]], axis=1)
         heights = origins @ up
@@ -91,8 +100,7 @@ class MinimumHeight(PostureConstraint):
             radii = self.capsules.of(robot)[1:]
             heights -= np.maximum(np.append(radii, 0.0), np.insert(radii, 0, 0.0))
         first = 1 if robot.joint_is_revolute[0] else 0
-        lowest = np.minimum(heights[:, first:].min(axis=1), (posture.targets @ up).min(axis=1))
-        return np.asarray(lowest >= self.height)
+        return np.concatenate([heights[:, first:], posture.targets @ up], axis=1) - self.height
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ that share a joint are left out. Everything else may not intersect. Pinocchio is
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -75,6 +76,7 @@ class SelfCollision:
         model, geometry = self._models
         full = self._coordinates(model, robot, q)
         data, shapes = model.createData(), geometry.createData()
+        _start_afresh(shapes)
         hits = [pin.computeCollisions(model, data, geometry, shapes, row, True) for row in full]
         return ~np.array(hits, dtype=bool)
 
@@ -94,6 +96,19 @@ class SelfCollision:
             else:
                 full[:, joint.idx_q] = column
         return full
+
+
+def _start_afresh(shapes: Any) -> None:
+    """Let every search for a collision start from the shapes, not from where the last one ended.
+
+    Coal remembers that place for every pair, and once it is next to zero it misses every collision of the pair
+    from there on: 649 of 1 360 among 20 000 configurations of an arm of cylinders. The switch is deprecated, but
+    ``gjk_initial_guess``, which is to replace it, does not end the remembering (Coal 3.0.3).
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        for request in shapes.collisionRequests:
+            request.enable_cached_gjk_guess = False
 
 
 def import_pinocchio() -> Any:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from calib_planner.arrays import check_array, check_number
+from calib_planner.arrays import FloatArray, check_array, check_number
 from calib_planner.errors import InputError
 from calib_planner.planning.constraints.room import PostureConstraint
 from calib_planner.robot import Capsules, Posture, Robot, segments
@@ -44,9 +44,10 @@ class TrackerRange(PostureConstraint):
         if not self.minimum < self.maximum:
             raise InputError("tracker range", f"{self.minimum} to {self.maximum}", "minimum < maximum, in m")
 
-    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
         d = distances(np.asarray(self.station), posture.targets)
-        return np.asarray(((self.minimum <= d) & (d <= self.maximum)).all(axis=1))
+        beyond = [] if np.isinf(self.maximum) else [self.maximum - d]
+        return np.concatenate([d - self.minimum, *beyond], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +75,9 @@ class TrackerElevation(PostureConstraint):
         if not self.low < self.high:
             raise InputError("tracker elevation", f"{self.low} to {self.high}", "low < high, in rad")
 
-    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
         angle = elevations(np.asarray(self.station), np.asarray(self.up), posture.targets)
-        return np.asarray(((self.low <= angle) & (angle <= self.high)).all(axis=1))
+        return np.concatenate([angle - self.low, self.high - angle], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +106,8 @@ class ReflectorAcceptance(PostureConstraint):
         angle = check_number("half_angle", self.half_angle, low=0, low_open=True, high=np.pi, unit="rad")
         object.__setattr__(self, "half_angle", angle)
 
-    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
-        """N postures → (N,).
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
+        """N postures → (N, targets), of the cosine.
 
         Raises:
             InputError: Neither one normal nor one per target.
@@ -116,7 +117,7 @@ class ReflectorAcceptance(PostureConstraint):
             raise InputError("normal", f"{len(normals)} normals", f"one, or {targets}: one per target")
         turned = normals @ posture.tip_rotation.transpose(0, 2, 1)
         cosines = incidence_cosines(np.asarray(self.station), posture.targets, turned)
-        return np.asarray((cosines >= np.cos(self.half_angle)).all(axis=1))
+        return cosines - np.cos(self.half_angle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,11 +146,11 @@ class LineOfSight(PostureConstraint):
         if self.near is not None:
             object.__setattr__(self, "near", check_number("near", self.near, low=0, unit="m"))
 
-    def holds(self, robot: Robot, posture: Posture) -> NDArray[np.bool_]:
+    def margins(self, robot: Robot, posture: Posture) -> FloatArray:
         station = np.asarray(self.station)
         radii = self.capsules.of(robot)[:-1]
         start, end = (points[:, None, :-1] for points in segments(robot, posture))
         near = float(radii.max()) if self.near is None else self.near
         ends = shortened(station, posture.targets, near)[:, :, None]
-        clearance = segment_distances(np.broadcast_to(station, ends.shape), ends, start, end)
-        return np.asarray((clearance >= radii).all(axis=(1, 2)))
+        clearance = segment_distances(np.broadcast_to(station, ends.shape), ends, start, end) - radii
+        return clearance.reshape(len(clearance), clearance.shape[1] * clearance.shape[2])

@@ -97,7 +97,7 @@ def descend(
         drop = value[live] - new_value
         moved = drop > 0
         step, change = new_x - x[live], new_gradient - g
-        _update(inverse, fresh, live[moved], step[moved], change[moved])
+        update(inverse, fresh, live[moved], step[moved], change[moved])
         # A failed search restarts from steepest descent once before the row is given up.
         lost = live[~moved & ~fresh[live]]
         inverse[lost] = np.eye(size)
@@ -111,11 +111,16 @@ def descend(
     return Descent(x, value, evaluations)
 
 
+def bound_coordinates(x: FloatArray, g: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+    """(rows, D) coordinates on a bound through which −g would push them."""
+    margin = 1e-9
+    return np.asarray(((x <= low + margin) & (g > 0)) | ((x >= high - margin) & (g < 0)))
+
+
 def _direction(
     x: FloatArray, g: FloatArray, inverse: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    margin = 1e-9
-    bound = ((x <= low + margin) & (g > 0)) | ((x >= high - margin) & (g < 0))
+    bound = bound_coordinates(x, g, low, high)
     free_g = np.where(bound, 0.0, g)
     direction = -np.matmul(inverse, free_g[:, :, None])[:, :, 0]
     direction[bound] = 0.0
@@ -154,7 +159,7 @@ def _line_search(
     return best_x, best_value, best_g, used
 
 
-def _update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray) -> None:
+def update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray) -> None:
     """BFGS update of the inverse Hessians of ``rows``, scaled at first use, skipped where s·y ≤ 0."""
     sy = (s * y).sum(axis=1)
     good = sy > 1e-10 * np.linalg.norm(s, axis=1) * np.linalg.norm(y, axis=1)

@@ -7,9 +7,10 @@ Starts. A third draws configurations from the approximate design (see ``bound``)
 rounding it, which the descent then repairs; a third repeats a good small plan, because eq. (20) and the paper's
 Table 2 show that good plans are a few good configurations repeated; the rest is random.
 
-Feasibility. Every start is feasible, and of every step only those configurations move that stay so: what comes
-out is feasible by construction. Steps do not follow the edge of the allowed set, so with constraints the best
-plan of each part is then improved by random feasible steps (see ``wander``) and descents in turn.
+Feasibility. Every start is feasible, and with constraints the descents keep inside and follow the edges of the
+allowed set (see ``interior``): what comes out is feasible by construction. An edge that a constraint does not
+show, because it says no more than yes or no, is not followed; with such a constraint the best plan of each part
+is then improved by random feasible steps (see ``wander``) and descents in turn.
 
 Work is cut into independent ``parts`` with their own seeds, whatever executes them: same seed, same plan.
 """
@@ -24,17 +25,32 @@ import numpy as np
 from calib_planner.arrays import FloatArray
 from calib_planner.planning.criteria import Criterion, ridged
 from calib_planner.planning.extended import ExtendedModel
-from calib_planner.planning.feasibility import Feasibility
+from calib_planner.planning.feasibility import Feasibility, PlanWalls
 from calib_planner.planning.information import InformationModel, Model
-from calib_planner.planning.search.descent import Descent, Mend, Objective, descend, wander
+from calib_planner.planning.search.descent import Descent, Objective, descend, wander
+from calib_planner.planning.search.interior import descend_inside
 
 CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
 FINALISTS = 3
 """Plans of each chunk that are polished to the end."""
-EXTENDED_ROUGH, EXTENDED_FINAL = (40, 2e-3), (80, 1e-4)
-"""Most iterations and tolerance of log Ψ with a whole error model: its promise is not known to 0.01 %, and an
-evaluation takes ten times as long."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How far descents go: most iterations, tolerance of log Ψ; with constraints the first and last pressure."""
+
+    iterations: int
+    tolerance: float
+    pressures: tuple[float, float] = (1e-2, 1e-3)
+
+
+PLAIN = Effort(80, 1e-4), Effort(200, 1e-7)
+"""Of all starts of a part, and of its finalists."""
+INSIDE = Effort(20, 1e-3), Effort(60, 1e-5, (1e-4, 1e-5))
+"""The same with constraints: the last pressure leaves 1e-5 of Ψ per active margin."""
+EXTENDED = Effort(40, 2e-3), Effort(80, 1e-4, (1e-4, 1e-5))
+"""With a whole error model: its promise is not known to 0.01 %, and an evaluation takes ten times as long."""
 BATCH = 4_000_000
 """Numbers in the inverse Hessians of descents side by side: beyond that, moving them through memory takes longer
 than the work on them, and a large plan would not notice for seconds that it was cancelled."""
@@ -130,12 +146,13 @@ def search_chunk(
     size = problem.size
     rows, used = _starts(problem, starts, rng, cancel)
     extended = isinstance(problem.model, ExtendedModel)
-    rough = descend_from(problem, size, rows, cancel, *(EXTENDED_ROUGH if extended else (80, 1e-4)))
+    first, last = efforts(problem)
+    rough = descend_from(problem, size, rows, cancel, first)
     finalists = rough.x[np.argsort(rough.value)[: 1 if extended else FINALISTS]]
-    last = mean_objective(problem, size) if problem.beside else None
-    final = descend_from(problem, size, finalists, cancel, *final_settings(problem), objective=last)
+    mean = mean_objective(problem, size) if problem.beside else None
+    final = descend_from(problem, size, finalists, cancel, last, objective=mean)
     work = used + rough.evaluations + final.evaluations
-    if problem.feasibility.constraints and isinstance(problem.model, InformationModel):
+    if problem.feasibility.masks and isinstance(problem.model, InformationModel):
         final, more = _along_the_edge(problem, problem.model, final, rng, cancel)
         work += more
     best = int(np.argmin(final.value))
@@ -143,9 +160,11 @@ def search_chunk(
     return SearchResult(configurations, -float(final.value[best]), starts, work)
 
 
-def final_settings(problem: SearchProblem) -> tuple[int, float]:
-    """Most iterations and tolerance of log Ψ of the last descents."""
-    return EXTENDED_FINAL if isinstance(problem.model, ExtendedModel) else (200, 1e-7)
+def efforts(problem: SearchProblem) -> tuple[Effort, Effort]:
+    """Of all starts of a part, and of its finalists."""
+    if isinstance(problem.model, ExtendedModel):
+        return EXTENDED
+    return INSIDE if problem.feasibility.constraints else PLAIN
 
 
 def _along_the_edge(
@@ -161,7 +180,7 @@ def _along_the_edge(
     for _ in range(EDGE_ROUNDS):
         plan = row.reshape(size, -1)
         moved, tried = wander(model, problem.criterion, problem.prior, problem.feasibility, plan, rng, cancel)
-        descended = descend_from(problem, size, moved[None], cancel, 60, 1e-6)
+        descended = descend_from(problem, size, moved[None], cancel, INSIDE[1])
         work += tried + descended.evaluations
         gained = value - float(descended.value[0])
         if gained > 0:
@@ -189,7 +208,7 @@ def _starts(
     tiled = -(-starts // 3) if kernel_size < size and not extended else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
-        kernel = descend_from(problem, kernel_size, first, cancel, 80, 1e-4)
+        kernel = descend_from(problem, kernel_size, first, cancel, efforts(problem)[0])
         evaluations += kernel.evaluations
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
@@ -202,7 +221,7 @@ def _starts(
 
 def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Move copies apart a little, where that is feasible."""
-    low, high = problem.model.robot.joint_limits.T
+    low, high = problem.feasibility.limits.T
     moved = np.clip(plans + rng.normal(0.0, 0.02, plans.shape), low, high)
     ok = problem.feasibility.mask(moved.reshape(-1, len(low))).reshape(plans.shape[:2])
     return np.where(ok[:, :, None], moved, plans)
@@ -213,42 +232,28 @@ def descend_from(
     size: int,
     rows: FloatArray,
     cancel: Callable[[], bool],
-    iterations: int,
-    tolerance: float,
+    effort: Effort,
     objective: Objective | None = None,
 ) -> Descent:
-    low, high = problem.model.robot.joint_limits.T
+    low, high = (np.tile(side, size) for side in problem.feasibility.limits.T)
     flat = rows.reshape(len(rows), -1)
     objective = plan_objective(problem, size) if objective is None else objective
     beside = max(BATCH // flat.shape[1] ** 2, 1)
-    ended = [
-        descend(
-            objective,
-            flat[first : first + beside],
-            np.tile(low, size),
-            np.tile(high, size),
-            iterations=iterations,
-            tolerance=tolerance,
-            cancel=cancel,
-            mend=_mend(problem.feasibility, size),
-        )
-        for first in range(0, len(flat), beside)
-    ]
+
+    def improved(part: FloatArray) -> Descent:
+        if not problem.feasibility.constraints:
+            return descend(
+                objective, part, low, high,
+                iterations=effort.iterations, tolerance=effort.tolerance, cancel=cancel,
+            )  # fmt: skip
+        return descend_inside(
+            objective, PlanWalls(problem.feasibility, size), part, low, high,
+            iterations=effort.iterations, tolerance=effort.tolerance, pressures=effort.pressures, cancel=cancel,
+        )  # fmt: skip
+
+    ended = [improved(flat[first : first + beside]) for first in range(0, len(flat), beside)]
     return Descent(
         np.concatenate([part.x for part in ended]),
         np.concatenate([part.value for part in ended]),
         sum(part.evaluations for part in ended),
     )
-
-
-def _mend(feasibility: Feasibility, size: int) -> Mend:
-    """Of a step of a plan, what is feasible: a configuration that would leave the allowed set stays."""
-
-    def mend(old: FloatArray, new: FloatArray) -> FloatArray:
-        if not feasibility.constraints:
-            return new
-        rows = (len(new), size, -1)
-        ok = feasibility.mask(new.reshape(len(new) * size, -1)).reshape(len(new), size, 1)
-        return np.where(ok, new.reshape(rows), old.reshape(rows)).reshape(new.shape)
-
-    return mend

@@ -26,7 +26,7 @@ from calib_planner.planning.search.multistart import (
     SearchProblem,
     SearchResult,
     descend_from,
-    final_settings,
+    efforts,
     mean_objective,
 )
 
@@ -85,7 +85,7 @@ def improved(
     for factor in steps:
         sharp = replace(problem, criterion=sharpened(problem.criterion, factor))
         mean = mean_objective(problem, problem.size) if problem.beside else None
-        descent = descend_from(sharp, problem.size, rows, cancel, *final_settings(problem), objective=mean)
+        descent = descend_from(sharp, problem.size, rows, cancel, efforts(problem)[1], objective=mean)
         rows, work = descent.x, work + descent.evaluations
         every.append(rows)
     flat = np.concatenate(every)
