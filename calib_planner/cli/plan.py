@@ -402,7 +402,8 @@ def show_tried(split: Split, console: Console) -> None:
         style = "bold" if p is split.plan else ""
         table.add_row(str(len(p.configurations)), each, str(p.measurements), value, *time, style=style)
     console.print(table)
-    if split.seconds and split.plan.quality.value > min(p.quality.value for p in split.tried):
-        console.print("The best in what the search looks at: smaller and larger errors and other places, too.")
+    if split.seconds and any(split.plan.quality.value > 1.01 * p.quality.value for p in split.tried):
+        text = "Chosen by what the search maximises: accuracy elsewhere has a share in it, and where the error model "
+        console.print(text + "is typical, so have smaller and larger errors.")
     if split.fewest:
         console.print(f"No plan of fewer than {split.fewest} measurements can reach it.")

@@ -247,6 +247,8 @@ def _plans() -> list[Case]:
         Case("plan_prove", f"{planar} --configurations 3 --starts 8 --prove"),
         Case("plan_prove_offsets", f"{planar} --parameters offsets --configurations 2 --repetitions 2 --prove"),
         Case("plan_for_accuracy", f"{planar} --accuracy 3e-5 --starts 4"),
+        Case("plan_for_accuracy_in_time", f"{planar} --accuracy 2e-5 --starts 4 --speed 0.1"),
+        Case("plan_for_time", f"{planar} --time-budget 4min --starts 4 --speed 0.1"),
         Case("plan_of_measurements", f"{planar} --measurements 8 --starts 4"),
         Case("plan_of_the_paper", f"{small} {two} --general-weight 0 --sigma 1e-4"),
         Case("plan_configuration_sigma", f"{planar} --measurements 6 --starts 4 --configuration-sigma 2e-5"),

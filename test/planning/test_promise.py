@@ -21,7 +21,7 @@ from calib_planner import (
 )
 from calib_planner.error_model import ErrorModel, Knowledge, Prior
 from calib_planner.measurements import Measurements
-from calib_planner.planning import Candidates, Search, plan_for_accuracy
+from calib_planner.planning import Candidates, Pace, Search, plan_for_accuracy, plan_for_time
 from calib_planner.planning.planner import value_of
 
 SIGMA = 3e-5
@@ -63,6 +63,12 @@ def test_the_promise_is_what_the_robot_shows(unknown: tuple[str, ...]) -> None:
     poses = np.stack([POSE, POSE + 0.3])
     found = plan(PlanProblem(robot, poses, 8, search=QUICK))
     assert achieved(robot, found, poses, 1) == pytest.approx(found.quality.predicted_accuracy, rel=0.03)
+
+
+def test_the_promise_of_unequal_visits_is_what_the_robot_shows() -> None:
+    found = plan_for_time(PlanProblem(kuka(), POSE, 1, search=QUICK), Pace(np.full(6, 0.1)), 220.0).plan
+    assert found.measurements > len(found.configurations) and len(set(found.repetitions)) > 1
+    assert achieved(kuka(), found, POSE[None], 3) == pytest.approx(found.quality.predicted_accuracy, rel=0.03)
 
 
 @pytest.mark.parametrize("unknown", UNKNOWNS[::2], ids="-".join)
