@@ -403,7 +403,7 @@ def show_tried(split: Split, console: Console) -> None:
         table.add_row(str(len(p.configurations)), each, str(p.measurements), value, *time, style=style)
     console.print(table)
     if split.seconds and any(split.plan.quality.value > 1.01 * p.quality.value for p in split.tried):
-        text = "Chosen by what the search maximises: accuracy elsewhere has a share in it, and where the error model "
-        console.print(text + "is typical, so have smaller and larger errors.")
+        text = "Chosen by what the search maximises: accuracy elsewhere has a share in it, and where the error "
+        console.print(text + "model is typical, so have smaller and larger errors.")
     if split.fewest:
         console.print(f"No plan of fewer than {split.fewest} measurements can reach it.")
