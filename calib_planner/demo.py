@@ -27,6 +27,7 @@ from calib_planner.errors import InputError
 from calib_planner.identification import IdentificationProblem, identify
 from calib_planner.io import (
     fresh_folder,
+    planned_error_model,
     read_error_model,
     write_estimate,
     write_measurements,
@@ -37,7 +38,6 @@ from calib_planner.planning import Callback, Plan, PlanProblem, Search, plan
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.simulation import SimulatedCell, independent_seeds, random_deviations
-from calib_planner.tracker import Isotropic
 from calib_planner.units import MILLI_UNIT, milli, signed
 
 RANDOM_PLANS = 12
@@ -127,14 +127,14 @@ def run_demo(
     folder: str | Path,
     callback: Callback | None = None,
 ) -> DemoResult:
-    """Run the demonstration and leave its files in a new folder: ``folder``, or ``folder-2``, … beside earlier ones.
+    """Run the demonstration; its files are in a new folder: ``folder``, or beside earlier ones ``folder-2``, ….
 
     Raises:
         InputError: The folder cannot be made or written.
     """
     folder, robot, size = fresh_folder(folder), Robot.load(ROBOT), (settings.configurations, settings.repetitions)
     search = Search(starts=settings.starts, seed=settings.seed)
-    model = read_error_model(ERROR_MODEL, Isotropic(settings.sigma))
+    model = planned_error_model(ERROR_MODEL, robot, settings.sigma)
     problem = PlanProblem(robot, [TEST_POSE], *size, error_model=model, search=search)
     best = plan(problem, callback)
     truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)

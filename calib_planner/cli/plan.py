@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -41,13 +40,13 @@ from calib_planner.cli.arguments import (
 from calib_planner.cli.gravity import add_gravity, with_gravity_of
 from calib_planner.cli.sheet import tell_sheet
 from calib_planner.cli.terminal import Terminal, configurations_table
-from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, gravity_of, typical_prior
+from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, typical_prior
 from calib_planner.errors import InputError
 from calib_planner.io import (
     make_folder,
+    planned_error_model,
     read_configurations,
     read_data,
-    read_error_model,
     read_prior,
     write_configurations,
     write_plan,
@@ -70,12 +69,10 @@ from calib_planner.planning import (
     plan_sheet,
     split_budget,
     timetable,
-    usual_error_model,
-    with_wide_placement,
 )
 from calib_planner.planning import plan as find_plan
 from calib_planner.robot import Robot
-from calib_planner.tracker import Isotropic, Noise
+from calib_planner.tracker import Noise
 from calib_planner.units import duration, length
 
 PAPER = "paper"
@@ -306,14 +303,7 @@ def _error_model(args: argparse.Namespace, robot: Robot, noise: Noise | float) -
     older = {"on": TYPICAL, "off": PAPER}.get(getattr(args, "discrepancy", "auto"))
     if older and args.error_model not in (None, older):
         raise InputError("--discrepancy", args.discrepancy, f"--error-model {args.error_model} alone")
-    wanted = args.error_model or older
-    if wanted is None:
-        return usual_error_model(robot, noise)
-    instrument = Isotropic(noise) if isinstance(noise, (float, int)) else noise
-    model = read_error_model(wanted, instrument)
-    if wanted != TYPICAL:
-        return model
-    return with_wide_placement(replace(model, gravity=gravity_of(robot)))
+    return planned_error_model(args.error_model or older, robot, noise)
 
 
 def _prior(given: str | None, robot: Robot) -> Prior | None:

@@ -32,12 +32,15 @@ The noise of an instrument, see ``tracker.Noise`` and config/instruments/:
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel, gravity_of
+from calib_planner.io.error_model import read_error_model
 from calib_planner.io.yaml import Node, read_yaml
 from calib_planner.planning import (
     Constraint,
@@ -49,6 +52,8 @@ from calib_planner.planning import (
     TrackerElevation,
     TrackerRange,
     WorkspaceBox,
+    usual_error_model,
+    with_wide_placement,
 )
 from calib_planner.robot import Capsules, Robot
 from calib_planner.tracker import Isotropic, LaserTracker, Noise
@@ -186,3 +191,24 @@ def _self_collision(section: Node) -> SelfCollision:
 
 def _up(section: Node) -> ArrayLike:
     return section["up"].numbers(3) if "up" in section else (0.0, 0.0, 1.0)
+
+
+# ── how a plan expects the robot to err ──────────────────────────────────────────────────────────────────
+
+
+def planned_error_model(source: str | None, robot: Robot, noise: Noise | float) -> ErrorModel:
+    """The error model of a plan, by name or from a file.
+
+    Args:
+        source: As for ``read_error_model``; ``None`` or empty for the robot's usual one.
+        robot: The robot that is planned for; ``typical`` takes the masses that it knows.
+        noise: The instrument, or the standard deviation of one coordinate [m].
+
+    Raises:
+        FileFormatError: As for ``read_error_model``.
+    """
+    if not source:
+        return usual_error_model(robot, noise)
+    instrument = Isotropic(noise) if isinstance(noise, (float, int)) else noise
+    model = read_error_model(source, instrument)
+    return with_wide_placement(replace(model, gravity=gravity_of(robot))) if source == "typical" else model

@@ -35,6 +35,7 @@ from std_srvs.srv import Trigger
 
 from calib_planner.demo import (
     ERROR_MODEL,
+    PAGE,
     ROBOT,
     TEST_POSE,
     DemoResult,
@@ -45,8 +46,10 @@ from calib_planner.demo import (
     print_table,
 )
 from calib_planner.errors import CalibPlannerError, InfeasibleError
-from calib_planner.io import fresh_folder, read_estimate
+from calib_planner.identification import IdentificationProblem, identify
+from calib_planner.io import fresh_folder, read_data, read_estimate
 from calib_planner.planning import PlanProblem
+from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import plan_from_message
 from calib_planner.ros.parameters import EVENTS, LATCHED
@@ -55,6 +58,8 @@ from calib_planner.units import length
 
 ATTEMPT = 8.0
 """Seconds after which an unanswered call is repeated."""
+PLANNING = 40.0
+"""Longest search of the plan [s]; the planner answers when it has ended."""
 NOT_YET = (PlanCalibration.Response.BUSY, PlanCalibration.Response.NOT_READY)
 """Answers of a planner that is still planning or not active yet: the call is repeated after ``PAUSE``."""
 PAUSE = 0.3
@@ -112,13 +117,13 @@ class DemoClient:
             self._executor.spin_once(timeout_sec=0.05)
         return True
 
-    def request_plan(self, request: PlanCalibration.Request, seconds: float = 90.0) -> PlanMessage:
+    def request_plan(self, request: PlanCalibration.Request, seconds: float = 180.0) -> PlanMessage:
         """The plan for ``request``.
 
         Raises:
             InfeasibleError: The planner refused; the error says why.
         """
-        response = self._call(self._plan, request, seconds, "plan")
+        response = self._call(self._plan, request, seconds, "plan", PLANNING + ATTEMPT)
         if response.status != PlanCalibration.Response.SUCCESS:
             raise InfeasibleError(response.field or "request", response.message)
         return response.plan
@@ -195,12 +200,12 @@ class DemoClient:
             sigma=plan.sigma,
         )
 
-    def _call(self, client: Any, request: Any, seconds: float, what: str) -> Any:
+    def _call(self, client: Any, request: Any, seconds: float, what: str, attempt: float = ATTEMPT) -> Any:
         deadline = time.monotonic() + seconds
         self.wait(client.service_is_ready, seconds, f"service {client.srv_name}")
         while time.monotonic() < deadline:
             future = client.call_async(request)
-            if self.wait(future.done, ATTEMPT):
+            if self.wait(future.done, attempt):
                 response = future.result()
                 later = time.monotonic() + PAUSE < deadline
                 if not later or getattr(response, "status", 0) not in NOT_YET:
@@ -250,7 +255,7 @@ def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> De
     """
     with own_domain() as domain, Nodes(folder / "log", domain) as nodes:
         screen.say("starting planner, identifier and simulated tracker")
-        nodes.start("planner_node", {"robot": ROBOT})
+        nodes.start("planner_node", {"robot": ROBOT, "error_model": ERROR_MODEL})
         save = {"save_folder": f"'{folder.resolve()}'", "samples": SAMPLES, "sigma": SIGMA}
         nodes.start("identifier_node", {"robot": ROBOT} | save)
         nodes.start("simulator_node", {"robot": ROBOT, "seed": seed, "sigma": SIGMA, "error_model": ERROR_MODEL})
@@ -265,17 +270,28 @@ def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> De
     robot = Robot.load(ROBOT).with_parameters(LEVEL)
     received = plan_from_message(plan).plan
     problem = PlanProblem(robot, [TEST_POSE], configurations, noise=received.sigma)
-    saved = read_estimate(next(iter(sorted(folder.glob("estimate_*.yaml"), key=_modified, reverse=True))))
+    saved = read_estimate(newest(folder, "estimate_*.yaml"))
     cell, learnt = demo_cell(robot, seed, received.sigma), (saved.knowledge(robot), saved.calibrated(robot))
     result = demo_report(problem, received, *learnt, cell, seed=seed, report=folder)
     draw(result, folder / "demo.png")
+    screen.say("writing the report")
+    report(folder, robot, seed)
     (folder / "demo.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n")
     return result
 
 
-def _modified(path: Path) -> float:
-    """When a file was written [s]."""
-    return path.stat().st_mtime
+def newest(folder: Path, pattern: str) -> Path:
+    """The file written last of those whose names fit."""
+    return max(folder.glob(pattern), key=lambda path: path.stat().st_mtime)
+
+
+def report(folder: Path, robot: Robot, seed: int) -> None:
+    """Write the page: the fit of all saved measurements, which the identifier makes when a plan is complete."""
+    path = newest(folder, "measurements_*.csv")
+    problem = IdentificationProblem(robot, read_data(path, robot).data, test_poses=[TEST_POSE])
+    files: list[tuple[str, str | Path]] = [("robot", ROBOT), ("data", path)]
+    made = provenance(files, seed=seed, estimate=str(newest(folder, "estimate_*.yaml")))
+    write_report(folder / PAGE, problem, identify(problem), made)
 
 
 def _measure(configurations: int, seed: int, client: DemoClient, screen: Screen) -> PlanMessage:
@@ -288,6 +304,7 @@ def _measure(configurations: int, seed: int, client: DemoClient, screen: Screen)
         configurations=configurations,
         sigma=SIGMA / math.sqrt(SAMPLES),
         seed=seed,
+        time_limit=PLANNING,
     )
     screen.say(f"planning {configurations} configurations")
     plan = client.request_plan(request)

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.io import config_folder, read_constraints
+from calib_planner.io import config_folder, planned_error_model, read_constraints
 from calib_planner.planning import (
     Callback,
     Candidates,
@@ -24,7 +24,6 @@ from calib_planner.planning import (
     PlanProblem,
     Search,
     plan,
-    usual_error_model,
 )
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import check_rows
@@ -112,7 +111,7 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         noise=noise,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        error_model=usual_error_model(robot, noise),
+        error_model=planned_error_model(settings.error_model, robot, noise),
         search=Search(
             starts=settings.starts or None,
             seed=int(request.seed),

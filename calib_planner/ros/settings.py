@@ -85,6 +85,9 @@ class PlannerParameters(PlanParameters):
     most_configurations: int = parameter(200, "largest number of configurations in a request", "", 1, 10000)
     most_test_poses: int = parameter(1000, "largest number of test poses in a request", "", 1, 10000)
     most_candidates: int = parameter(2000, "largest number of candidates in a request", "", 1, 10000)
+    error_model: str = parameter(
+        "", ERROR_MODEL + "; empty = typical, but paper for the robots of the paper", read_only=True
+    )
     constraints: str = at_configure("", CONSTRAINTS)
     joint_speed: float = parameter(0.5, "largest speed of turning joints on ~/trajectory", "rad/s", 1e-3, 100.0)
     slide_speed: float = parameter(0.1, "largest speed of sliding joints on ~/trajectory", "m/s", 1e-4, 100.0)
