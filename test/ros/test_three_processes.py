@@ -104,10 +104,13 @@ def test_wrong_use_of_the_demo(option: list[str], capsys: pytest.CaptureFixture[
     assert caught.value.code == 2 and capsys.readouterr().err
 
 
-def test_a_demo_that_cannot_be_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert demo.main(["--configurations", "1", "--json", "--output", str(tmp_path)]) == 1
+def test_a_demo_that_cannot_be_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "LEVEL", "no_such_level")  # the planner refuses the request
+    assert demo.main(["--configurations", "3", "--json", "--output", str(tmp_path)]) == 1
     shown = capsys.readouterr()
-    assert shown.out == "" and "configurations" in shown.err and "Traceback" not in shown.err
+    assert shown.out == "" and "no_such_level" in shown.err and "Traceback" not in shown.err
 
 
 def running_with(text: str) -> list[str]:
