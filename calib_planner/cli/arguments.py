@@ -14,7 +14,7 @@ from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
 from calib_planner.io import Reading, angle_factors, read_configurations
-from calib_planner.robot import Robot
+from calib_planner.robot import Coupling, Robot, parse_coupling
 from calib_planner.tracker import Isotropic
 from calib_planner.units import UNSAID, Units, quantity
 
@@ -105,6 +105,7 @@ def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: 
     text = "name of a shipped robot, robot YAML or URDF" + (f" ({otherwise})" if otherwise else "")
     option(group, "--robot", "R", text, required=not otherwise)
     add_links(group)
+    add_couple(group)
     parser.set_defaults(targets=None)
     if targets:
         text = "a reflector in the frame of the last link [m]; repeat for several"
@@ -117,6 +118,20 @@ def add_links(group: Group) -> None:
     """The two ends of the chain in a URDF."""
     option(group, "--base-link", "LINK", "first link of the chain in a URDF (its root)")
     option(group, "--tip-link", "LINK", "last link of the chain in a URDF (its only leaf)")
+
+
+def add_couple(group: Group) -> None:
+    """Joints that the controller shows against others."""
+    text = "the controller shows j3 plus j2 (parallelogram arms); also j3-=j2, j3+=FACTOR*j2; repeat for several"
+    option(group, "--couple", "j3+=j2", text, kind=coupling, action="append")
+
+
+def coupling(text: str) -> Coupling:
+    """``j3+=j2``."""
+    try:
+        return parse_coupling(text, "--couple")
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error).removeprefix("--couple: ")) from None
 
 
 def add_parameters(parser: argparse.ArgumentParser, unknown: str = "none") -> None:
@@ -227,6 +242,8 @@ def load_robot(args: argparse.Namespace) -> Robot:
     robot = Robot.load(args.robot, base_link=args.base_link, tip_link=args.tip_link)
     for remark in robot.remarks:
         Terminal(json_wanted=args.json).note(f"{args.robot}: {remark}")
+    if args.couple:
+        robot = robot.with_couplings(args.couple, "--couple")
     return robot if args.targets is None else robot.with_targets(rows("--targets", args.targets, "xyz"))
 
 

@@ -172,7 +172,13 @@ class Gravity:
         for part in self.masses_of(robot):
             at = len(robot.joint_names) - 1 if part.joint is None else part.joint
             last[part.name] = max(at, last.get(part.name, -1))
-        return [(mass, j) for mass, end in last.items() for j in range(end + 1)]
+        return [(mass, j) for mass, end in last.items() for j in self._loaded(robot, end)]
+
+    def _loaded(self, robot: Robot, end: int) -> list[int]:
+        """The joints that a mass behind joint ``end`` loads: those before it, and those coupled to them."""
+        if robot.coupling is None:
+            return list(range(end + 1))
+        return [int(j) for j in np.flatnonzero(np.abs(robot.coupling[: end + 1]).sum(axis=0) > 0.0)]
 
     def joints(self, robot: Robot) -> IntArray:
         """(K,) the joint of every coefficient."""
@@ -199,6 +205,8 @@ class Gravity:
         rate = np.where(in_front[..., None], whole * turns[:, None], alone)
         load = self._loads(poses)
         moved = (load != 0.0)[:, None] * rate * load[:, :, None]  # what a link carries no joint behind it moves
+        if robot.coupling is not None:
+            moved = np.einsum("jl,pjin,ik->plkn", robot.coupling, moved, robot.coupling)
         return np.ascontiguousarray(self._per_mass(robot, moved).transpose(2, 0, 1))
 
     def _axes(self, poses: Poses) -> tuple[FloatArray, FloatArray]:
@@ -249,6 +257,8 @@ class Gravity:
         turning = (self._arms(poses) * sideways).sum(axis=2)  # (w × arm) · d = arm · (d × w)
         pull = np.einsum("x,lxn->ln", self._down(robot), axes)
         felt = np.where(robot.joint_is_revolute[:, None], turning, pull) * self._loads(poses)
+        if robot.coupling is not None:
+            felt = np.einsum("jl,pjn->pln", robot.coupling, felt)
         return np.ascontiguousarray(self._per_mass(robot, felt).T)
 
 
@@ -304,15 +314,15 @@ def link_points(robot: Robot, q: FloatArray, joint: int | None, xyz: ArrayLike) 
     """(N, 3) where ``xyz`` (3,) of the link that joint number ``joint`` moves is; ``None``: of the tip [m]."""
     x, y, z = check_array("mass", xyz, (3,))
     part = _link(robot, joint, (float(x), float(y), float(z)))
-    return part.positions(q[:, : len(part.joint_names)])[:, 0]
+    return part.positions(robot.motions(q)[:, : len(part.joint_names)])[:, 0]
 
 
 @lru_cache(maxsize=64)
 def _link(robot: Robot, joint: int | None, xyz: tuple[float, float, float]) -> Robot:
-    """The robot up to a link, its target being at ``xyz`` of that link; a simulation asks at every sample."""
+    """The robot up to a link, by motions, its target at ``xyz`` of that link; needed at every sample."""
     branch = target_elements(np.array([xyz]))
     if joint is None:
-        return replace(robot, targets=branch, parameter_names=())
+        return replace(robot, targets=branch, parameter_names=(), couplings=())
     end = next(i for i, e in enumerate(robot.elements) if e.joint == joint) + 1
     # A joint with an oblique axis is turned back behind its motion; its link is there.
     before, behind = robot.elements[end - 2], robot.elements[end : end + 2]

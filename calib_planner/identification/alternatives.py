@@ -58,7 +58,7 @@ from calib_planner.identification.likelihood import (
 )
 from calib_planner.identification.registration import place, tip_poses
 from calib_planner.measurements import Measurements
-from calib_planner.robot import BASE_PARAMETERS, Robot, is_nuisance, target_parameters
+from calib_planner.robot import BASE_PARAMETERS, Coupling, Robot, is_nuisance, target_parameters
 from calib_planner.units import SPELLINGS, counted, length, listed, milliradians
 
 BoolArray = NDArray[np.bool_]
@@ -202,7 +202,8 @@ TABLE = {
             "both",
             "one joint is shown, or driven, together with another one",
             "{joint} is coupled to {beside}: it stands at {joint} {size} {beside}",
-            "replace the column {joint} of the data by {joint} {size} {beside}",
+            "add --couple {option} if the controller shows it so; otherwise replace the column {joint} "
+            "of the data by {joint} {size} {beside}",
         ),
         Row(
             "columns",
@@ -765,6 +766,8 @@ class _Fine:
             size, unit = float(len(q.rows)), "1"
             words = counted(len(q.rows), "parameter") + (" lies" if len(q.rows) == 1 else " lie")
         told: dict[str, Any] = {"size": words, "parameter": q.parameter, "rows": _ranges(q.rows)}
+        if q.code == "couple":
+            told["option"] = Coupling(str(joint), str(beside), float(f"{-first:.4g}"))
         return _named(
             q.code,
             size,
@@ -1254,7 +1257,8 @@ class _Gross:
                 for sign, word in ((1.0, "+"), (-1.0, "−")):
                     both = _with_column(q, j, q[:, j] + sign * q[:, k])
                     pair = {"joint": names[j], "beside": names[k]}
-                    yield self._change("couple", both, p, words={"size": word}, size=sign, unit="1", **pair)
+                    words = {"size": word, "option": Coupling(names[j], names[k], -sign)}
+                    yield self._change("couple", both, p, words=words, size=sign, unit="1", **pair)
         for j, k in combinations(range(len(names)), 2):
             if self.turns[j] == self.turns[k]:
                 other = _with_column(_with_column(q, j, q[:, k]), k, q[:, j])

@@ -41,6 +41,7 @@ from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import ChiSquare, Estimate, PointNoise, Reason, Verdict
 from calib_planner.io.yaml import Node, read_document, write_document
 from calib_planner.robot import Robot, is_nuisance
+from calib_planner.units import listed
 
 T = TypeVar("T")
 BASE = ("x", "y", "z", "yaw", "pitch", "roll", "rx", "ry", "rz")
@@ -76,6 +77,8 @@ def document_of(estimate: Estimate) -> dict[str, Any]:
     content = estimate.to_dict()
     unlimited = {key: getattr(estimate.accuracy, name) for key, name in UNLIMITED.items() if key in content}
     content["error_model"] |= plain(_knowledge_mapping(estimate.knowledge))
+    couple = [str(one) for one in estimate.calibrated.couplings]
+    content |= {"couple": couple} if couple else {}
     return content | plain(unlimited, keep_infinite=True) | placement(estimate)
 
 
@@ -126,6 +129,7 @@ def parse_estimate(top: Node) -> SavedEstimate:
     return SavedEstimate(
         robot=top["robot"].of_kind("str"),
         joint_names=top["joint_names"].of_kind("tuple[str, ...]"),
+        couple=top.get("couple", []).of_kind("tuple[str, ...]"),
         parameters=names,
         units=tuple(row["unit"].of_kind("str") for row in rows),
         nominal=column("nominal"),
@@ -284,6 +288,7 @@ class SavedEstimate:
         placement_alone: (P,) values of a fit of placement alone [unit]; ``None`` in older files.
         learnt: What predicts, or ``None`` in older files.
         document: Everything that the file holds, as plain values.
+        couple: Joints that the controller shows against others, ``j3+=j2``.
     """
 
     robot: str
@@ -306,6 +311,7 @@ class SavedEstimate:
     placement_alone: FloatArray | None
     learnt: SavedKnowledge | None
     document: dict[str, Any]
+    couple: tuple[str, ...] = ()
 
     def calibrated(self, robot: Robot) -> Robot:
         """The nominal ``robot`` with all identified values, base and targets too: ``Estimate.calibrated`` again.
@@ -359,6 +365,11 @@ class SavedEstimate:
             raise InputError(
                 "estimate", f"joints {', '.join(self.joint_names)}", wanted, "give the robot it is of"
             )
+        couple = [str(one) for one in robot.couplings]
+        if sorted(self.couple) != sorted(couple):
+            wanted = f"{listed(self.couple, none='none')}, as the data of the estimate were shown"
+            got = f"coupled joints {listed(couple, none='none')}"
+            raise InputError("robot", got, wanted, "give --couple, or couple: in the robot YAML, as for identify")
         nominal = {p.name: p.nominal for p in robot.with_parameters(robot.available_parameters).parameters}
         starts = dict(zip(self.parameters, self.nominal.tolist(), strict=True))
         for name in self.chain_parameters:

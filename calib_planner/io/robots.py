@@ -13,6 +13,7 @@ A robot YAML holds the chain of eq. (2) element by element:
     lengths: [l1]                 # the parameters of the level "lengths"
     offsets: [dq1]                # the parameters of the level "offsets"
     levels: {elbow: [l1, dq2]}    # optional, further levels
+    couple: [j3+=j2]              # optional: the controller shows j3 plus j2, see ``robot.coupling``
     masses:                       # optional: what a joint carries; mass [kg], centre of gravity [m]
       - {joint: q2, mass: 4.2, xyz: [0.4, 0, 0.05]}
 
@@ -34,6 +35,7 @@ makers of robots publish it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -50,9 +52,11 @@ from calib_planner.robot import (
     Element,
     LinkMass,
     Robot,
+    believable_limits,
     check_joint_names,
     dh_elements,
     dh_levels,
+    parse_coupling,
     pose_elements,
     register_file_reader,
     rotation,
@@ -63,7 +67,8 @@ URDF_SUFFIXES = (".urdf", ".xml", ".xacro", ".sdf")
 """Files that are read as URDF; what is another format after all is told so by its content."""
 YAML_SUFFIXES = (".yaml", ".yml")
 CHAINS = ("elements", "dh", "modified_dh")
-KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", "lengths", "offsets", "levels", "masses")
+LEVELS = ("lengths", "offsets", "levels")
+KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", *LEVELS, "couple", "masses")
 ELEMENT_KEYS = ("type", "value", "joint", "sign", "parameter")
 TABLE_KEYS = ("rows", "length_unit", "angle_unit")
 ROW_KEYS = ("joint", "type", "theta", "d", "a", "alpha", "sign")
@@ -151,12 +156,22 @@ def _robot(top: Node) -> Robot:
         source=str(top.path),
         link_masses=masses,
     )
+    limits = robot.joint_limits.copy()
+    remarks: list[str] = []
     for joint, turns in zip(joints, robot.joint_is_revolute, strict=True):
         valid = ANGLES if turns else LENGTHS
         if joint.get("unit", next(iter(valid))).value not in valid:
             kind = "turns" if turns else "slides"
             raise joint["unit"].refused(f"one of: {', '.join(valid)}, as the joint {kind}")
-    return robot
+    for row, name in enumerate(names):
+        low, high, remark = believable_limits(name, *limits[row].tolist(), turns=robot.joint_is_revolute[row])
+        limits[row] = low, high
+        remarks += [remark] * bool(remark)
+    robot = replace(robot, joint_limits=limits, remarks=tuple(remarks))
+    if "couple" not in top:
+        return robot
+    texts = [node.name() for node in top["couple"].items()]
+    return robot.with_couplings([parse_coupling(text) for text in texts])
 
 
 def _chain(top: Node, names: Sequence[str]) -> tuple[list[Element], Levels]:

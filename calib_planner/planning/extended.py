@@ -48,7 +48,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import ErrorModel, JointFunctions, Poses, joint_units
-from calib_planner.robot import Layout, Linearisation, Robot
+from calib_planner.robot import Layout, Robot
 from calib_planner.tracker import Isotropic, Noise, covariance_gradient
 
 try:
@@ -459,10 +459,7 @@ class LinearisedExtension:
     def _pulled(self, by_jacobian: FloatArray, by_lever: FloatArray) -> FloatArray:
         """(N, joints) ∂Ψ/∂q through J and c_l."""
         lin = self.poses.linearisation
-        levers = Linearisation(
-            lin.points, lin.joint_columns, lin.joint_columns, lin.joint_axes, lin.joint_axes, self.model.layout
-        )
-        result = levers.pull_back(by_lever * joint_units(self.model.robot))
+        result = lin.pull_back_levers(by_lever * joint_units(self.model.robot), self.model.layout)
         return result + lin.pull_back(by_jacobian) if len(lin.columns) else result
 
 

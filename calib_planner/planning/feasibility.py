@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning.constraints.room import JointRange, PostureConstraint
+from calib_planner.planning.constraints.room import JointRange, MotionLimits, PostureConstraint
 from calib_planner.robot import Posture, Robot
 
 PATIENCE = 200_000
@@ -55,11 +55,16 @@ class Feasibility:
 
     Attributes:
         robot: The robot they are about.
-        constraints: The constraints; none means the joint limits alone.
+        constraints: The constraints; none means the joint limits alone. Those of motions that are coupled are
+            added.
     """
 
     robot: Robot
     constraints: tuple[Constraint, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.robot.couplings and not any(isinstance(c, MotionLimits) for c in self.constraints):
+            object.__setattr__(self, "constraints", (MotionLimits(), *self.constraints))
 
     @cached_property
     def limits(self) -> FloatArray:

@@ -6,6 +6,7 @@ docs/glossary.md explains the words.
 
 from calib_planner.robot.capsules import Capsules, segments
 from calib_planner.robot.chain import Robot, register_file_reader, target_elements
+from calib_planner.robot.coupling import Coupling, parse_coupling
 from calib_planner.robot.elements import (
     KINDS,
     ROW_TYPES,

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, check_array, check_configurations, frozen
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.robot.coupling import Coupling, coupling_matrix, enclosing_limits
 from calib_planner.robot.elements import Element, roll_pitch_yaw, rotation
 from calib_planner.robot.kinematics import Program, codes_of, compile_program, structure_of
 from calib_planner.robot.linearisation import Layout, Linearisation, Posture
@@ -59,13 +60,17 @@ class Robot:
         elements: The trunk, base pose first, up to the tip.
         targets: Per target the three translations from the tip, in the tip's frame.
         joint_names: Names in joint order.
-        joint_limits: (joints, 2) lower and upper [rad | m].
+        joint_limits: (joints, 2) lower and upper [rad | m]; with ``couplings`` the box around what
+            ``motion_limits`` allow.
         levels: Level name → parameter names.
         parameter_names: Active parameters, the order of all Jacobian columns.
         source: What the robot was read from.
         from_urdf: Whether it was read from a URDF, that is from the description of a real robot.
         link_masses: What its file says of the masses of its links; see ``mass_fault``.
         remarks: What is odd in its file, or was chosen when it was read, sentences without a full stop.
+        couplings: Joints that the controller shows against others; see ``coupling``. All coordinates are then
+            the controller's.
+        motion_limits: (joints, 2) limits of the joints' own motions [rad | m], if there are couplings.
     """
 
     name: str
@@ -79,6 +84,8 @@ class Robot:
     from_urdf: bool = False
     link_masses: tuple[LinkMass, ...] = ()
     remarks: tuple[str, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
+    motion_limits: FloatArray | None = None
 
     def __post_init__(self) -> None:
         joints = [e.joint for e in self.elements if e.joint is not None]
@@ -155,6 +162,19 @@ class Robot:
         names = tuple(n for n in self.parameter_names if n not in gone)
         return replace(self, targets=branches, parameter_names=names)
 
+    def with_couplings(self, couplings: Sequence[Coupling], field: str = "couple") -> Robot:
+        """The robot whose controller shows some joints against others, in place of what was said of it before.
+
+        Raises:
+            InputError: Not joints of the robot, or nothing that could be undone; names ``field``.
+        """
+        own = self.joint_limits if self.motion_limits is None else self.motion_limits
+        if not couplings:
+            return replace(self, couplings=(), motion_limits=None, joint_limits=own)
+        matrix = coupling_matrix(couplings, self.joint_names, field)
+        box = enclosing_limits(own, matrix)
+        return replace(self, couplings=tuple(couplings), motion_limits=own, joint_limits=box)
+
     # ── what it is ───────────────────────────────────────────────────────────────────────────────────
 
     @cached_property
@@ -207,10 +227,20 @@ class Robot:
                 reach += abs(e.value) + slide
         return fault_of(self.link_masses, self.joint_names, reach)
 
+    @cached_property
+    def coupling(self) -> FloatArray | None:
+        """(joints, joints) C: motions are ``q @ C.T``; ``None`` where every joint is shown by itself."""
+        return coupling_matrix(self.couplings, self.joint_names) if self.couplings else None
+
+    def motions(self, q: NDArray[Any]) -> NDArray[Any]:
+        """(N, joints) coordinates as shown → (N, joints) motions of the chain's joints [rad | m]."""
+        return q if self.coupling is None else q @ self.coupling.T
+
     def beyond_limits(self, q: FloatArray) -> NDArray[np.bool_]:
-        """(N, joints) [rad | m] → (N, joints) bool: which coordinates are outside the joint limits."""
-        low, high = self.joint_limits.T
-        return np.asarray((q < low - LIMIT_TOLERANCE) | (q > high + LIMIT_TOLERANCE))
+        """(N, joints) [rad | m] → (N, joints) bool: which joints are outside their limits."""
+        low, high = (self.joint_limits if self.motion_limits is None else self.motion_limits).T
+        moved = self.motions(q)
+        return np.asarray((moved < low - LIMIT_TOLERANCE) | (moved > high + LIMIT_TOLERANCE))
 
     def check_within_limits(self, field: str, q: FloatArray) -> None:
         """Refuse configurations (N, joints) [rad | m] outside the joint limits.
@@ -221,10 +251,10 @@ class Robot:
         beyond = np.argwhere(self.beyond_limits(q))
         if len(beyond):
             i, j = (int(k) for k in beyond[0])
-            low, high = self.joint_limits[j]
+            low, high = (self.joint_limits if self.motion_limits is None else self.motion_limits)[j]
             raise InputError(
                 f"{field}[{i}], joint {self.joint_names[j]}",
-                f"{q[i, j]:.6g}",
+                f"{self.motions(q)[i, j]:.6g}",
                 f"a value within the joint limits [{low:.6g}, {high:.6g}] rad or m",
                 "check units (degrees?) and joint order",
             )
@@ -276,12 +306,13 @@ class Robot:
         """∂position/∂joint, shape (N, 3·targets, joints) [m/rad | 1], base frame."""
         clean, amounts = self._check_q(q), self._amounts(self._check_deviations(deviations))
         joints, t = self._layout.joint_elements, len(self.targets)
-        rows = self._program(amounts, joints, ()).run(np.ascontiguousarray(clean.T), amounts)
-        return rows[3 * t :].reshape(len(joints), 3 * t, -1).transpose(2, 1, 0)
+        rows = self._program(amounts, joints, ()).run(np.ascontiguousarray(self.motions(clean).T), amounts)
+        columns: FloatArray = rows[3 * t :].reshape(len(joints), 3 * t, -1).transpose(2, 1, 0)
+        return columns if self.coupling is None else columns @ self.coupling
 
     def posture(self, q: ArrayLike) -> Posture:
         """Where joints, tip and targets are: every frame of the chain in one pass; see ``Posture``."""
-        clean = np.ascontiguousarray(self._check_q(q).T)
+        clean = np.ascontiguousarray(self.motions(self._check_q(q)).T)
         rows = self._posture_program.run(clean, self._nominal_amounts)
         n, t = len(self.joint_names), len(self.targets)
         points = rows.reshape(t + 2 * n + 4, 3, -1).transpose(2, 0, 1)
@@ -362,19 +393,19 @@ class Robot:
         """Rows of the program; ``q`` (N, joints), real or complex."""
         amounts = self._amounts(deviations)
         wanted = self._layout.parameter_elements if columns else ()
-        return self._program(amounts, wanted, ()).run(np.ascontiguousarray(q.T), amounts)
+        return self._program(amounts, wanted, ()).run(np.ascontiguousarray(self.motions(q).T), amounts)
 
     def _linearise(self, q: NDArray[Any], deviations: NDArray[Any] | None) -> Linearisation:
         lay = self._layout
         amounts = self._amounts(deviations)
         both = lay.parameter_elements + lay.joint_elements
-        rows = self._program(amounts, both, both).run(np.ascontiguousarray(q.T), amounts)
+        rows = self._program(amounts, both, both).run(np.ascontiguousarray(self.motions(q).T), amounts)
         t, p, n = len(self.targets), len(lay.parameter_elements), q.shape[0]
         split = 3 * t * (1 + len(both))
         columns = rows[3 * t : split].reshape(len(both), t, 3, n)
         axes = rows[split:].reshape(len(both), 3, n)
         points = rows[: 3 * t].reshape(t, 3, n)
-        return Linearisation(points, columns[:p], columns[p:], axes[:p], axes[p:], lay)
+        return Linearisation(points, columns[:p], columns[p:], axes[:p], axes[p:], lay, self.coupling)
 
 
 def target_elements(xyz: FloatArray) -> tuple[tuple[Element, ...], ...]:

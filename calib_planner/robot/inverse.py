@@ -180,7 +180,8 @@ def _residual_and_jacobian(robot: Robot, goals: Goals, q: FloatArray) -> tuple[F
         angle = Rotation.from_matrix(turned).as_rotvec()
         r = np.concatenate([r, goals.lever * angle], axis=1)
         columns = np.concatenate([columns, np.where(turning, goals.lever * axes, 0.0)], axis=2)
-    return r, columns.transpose(0, 2, 1)
+    jacobian: FloatArray = columns.transpose(0, 2, 1)
+    return r, jacobian if robot.coupling is None else jacobian @ robot.coupling
 
 
 def _nudged(robot: Robot, goals: Goals, q: FloatArray, nudge: float) -> tuple[IntArray, FloatArray]:

@@ -68,18 +68,27 @@ class Linearisation:
     Attributes:
         points: (targets, 3, N) target positions, base frame [m].
         columns: (P, targets, 3, N) derivative by each parameter [m / unit].
-        joint_columns: (joints, targets, 3, N) derivative by each joint [m / rad or 1].
+        motion_columns: (joints, targets, 3, N) derivative by each joint's own motion [m / rad or 1].
         parameter_axes: (P, 3, N) axis of the element of each parameter, base frame.
         joint_axes: (joints, 3, N) axis of each joint, base frame.
         layout: Chain order of parameters and joints.
+        coupling: (joints, joints) C of ``robot.coupling``; ``None``: each joint is shown by itself.
     """
 
     points: FloatArray
     columns: FloatArray
-    joint_columns: FloatArray
+    motion_columns: FloatArray
     parameter_axes: FloatArray
     joint_axes: FloatArray
     layout: Layout
+    coupling: FloatArray | None = None
+
+    @cached_property
+    def joint_columns(self) -> FloatArray:
+        """(joints, targets, 3, N) derivative by each joint's coordinate [m / rad or 1]."""
+        if self.coupling is None:
+            return self.motion_columns
+        return np.einsum("jk,jtxn->ktxn", self.coupling, self.motion_columns)
 
     def jacobian(self) -> FloatArray:
         """Identification Jacobian (N, 3·targets, P), rows x, y, z target by target, contiguous."""
@@ -96,7 +105,12 @@ class Linearisation:
         Returns:
             (N, joints), ∂f/∂q.
         """
-        arrays = (self.columns, self.parameter_axes, self.joint_columns, self.joint_axes)
+        gradient = self._pull_back(weights)
+        return gradient if self.coupling is None else gradient @ self.coupling
+
+    def _pull_back(self, weights: FloatArray) -> FloatArray:
+        """The same by the motions."""
+        arrays = (self.columns, self.parameter_axes, self.motion_columns, self.joint_axes)
         if _kernel is not None and weights.flags.c_contiguous and all(a.flags.c_contiguous for a in arrays):
             out = np.empty((len(weights), len(self.joint_axes)))
             _kernel.pull_back(self.layout.code, *arrays, weights, out)
@@ -104,7 +118,7 @@ class Linearisation:
         return self.pull_back_numpy(weights)
 
     def pull_back_numpy(self, weights: FloatArray) -> FloatArray:
-        """``pull_back`` without the compiled kernel."""
+        """``pull_back`` by the motions, without the compiled kernel."""
         p, targets, _, n = self.columns.shape
         weights = np.ascontiguousarray(weights[:, :, :p].transpose(2, 1, 0)).reshape(p, targets, 3, n)
         lay = self.layout
@@ -120,8 +134,23 @@ class Linearisation:
             ahead = np.zeros((len(front) + 1, *pushes.shape[1:]))
             np.cumsum(pushes, axis=0, out=ahead[1:])
             rotations = np.searchsorted(front, before)
-            gradient += (self.joint_columns * ahead[rotations]).sum(axis=(1, 2))
+            gradient += (self.motion_columns * ahead[rotations]).sum(axis=(1, 2))
         return gradient.T
+
+    def pull_back_levers(self, weights: FloatArray, layout: Layout) -> FloatArray:
+        """Gradient in the joints of Σ weights · ``joint_columns``.
+
+        Args:
+            weights: (N, 3·targets, joints).
+            layout: The chain's, with the joints as its parameters.
+
+        Returns:
+            (N, joints).
+        """
+        if self.coupling is not None:  # to the motions, whose columns these are sums of
+            weights = weights @ self.coupling.T
+        moved, axes = self.motion_columns, self.joint_axes
+        return Linearisation(self.points, moved, moved, axes, axes, layout, self.coupling).pull_back(weights)
 
 
 def _cross(u: FloatArray, v: FloatArray) -> FloatArray:

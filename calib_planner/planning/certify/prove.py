@@ -60,6 +60,7 @@ PROOF_STATUS = {
     "time_limit": "The bound is proven, less closely than wanted because time was up",
     "work": "The bound is numerical: the proof takes longer than a plan should, ask for it (--prove)",
     "model": "The bound stays numerical: with a whole error model the sensitivity is no polynomial of the joints",
+    "coupled": "The bound stays numerical: coupled joints make the sensitivity a polynomial of higher degree",
     "noise": "The bound stays numerical: only isotropic noise makes the sensitivity a polynomial",
     "joints": "The bound stays numerical: too many joints for a proof",
     "candidates": "The bound is proven: every candidate was looked at",
@@ -256,6 +257,8 @@ def _obstacle(model: Model) -> str:
     """Why nothing can be proven, or empty."""
     if isinstance(model, ExtendedModel):
         return "model"
+    if model.robot.couplings:
+        return "coupled"
     if not isinstance(model.noise, Isotropic):
         return "noise"
     return "joints" if _grid(model) > LARGEST_GRID else ""

@@ -152,6 +152,20 @@ class JointRange:
         return np.asarray(((low <= q) & (q <= high)).all(axis=1))
 
 
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of the joints' own motions, where a controller shows some joints against others.
+
+    The box of what is shown encloses them and is wider; ``Feasibility`` adds this by itself.
+    """
+
+    name: str = "joint limits behind the coupling"
+
+    def allowed(self, robot: Robot, q: FloatArray) -> NDArray[np.bool_]:
+        """(N, joints) → (N,)."""
+        return np.asarray(~robot.beyond_limits(q).any(axis=1))
+
+
 @dataclass(frozen=True, eq=False)
 class Custom:
     """The user's own condition.

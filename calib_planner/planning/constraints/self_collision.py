@@ -86,7 +86,7 @@ class SelfCollision:
         for joint in model.joints[1:]:
             if joint.nq == 2:
                 full[:, joint.idx_q] = 1.0
-        for name, column in zip(robot.joint_names, q.T, strict=True):
+        for name, column in zip(robot.joint_names, robot.motions(q).T, strict=True):
             if not model.existJointName(name):
                 names = ", ".join(list(model.names)[1:])
                 raise InputError(f"joint {name}", f"not in {self.urdf_path}", f"one of its joints: {names}")
