@@ -92,7 +92,7 @@ def with_cell(top: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
     ]
     taken = given.union(*(group for group in either if group & given))
     if "--robot" in given:  # links are of the cell's robot
-        taken |= {"--base-link", "--tip-link"}
+        taken |= {"--base-link", "--tip-link", "--couple"}
     added: list[str] = []
     for flag, values in cell.options().items():
         action = command._option_string_actions.get(flag)

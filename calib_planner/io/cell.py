@@ -24,12 +24,14 @@ from pathlib import Path
 from typing import Any
 
 from calib_planner.error_model import ACCURACIES, ErrorModel, Payload, gravity_of, typical
+from calib_planner.errors import InputError
 from calib_planner.io.conditions import read_constraints, read_instrument, read_vertical
 from calib_planner.io.error_model import read_error_model
 from calib_planner.io.robots import Robot, shipped_robots
 from calib_planner.io.text import user_path, write_text
 from calib_planner.io.yaml import Node, read_yaml, yaml_line
 from calib_planner.planning import Constraint
+from calib_planner.robot import parse_coupling
 from calib_planner.tracker import Isotropic, Noise
 
 NAMED_MODELS = ("typical", "paper")
@@ -152,6 +154,16 @@ def _mounting(node: Node) -> str | tuple[float, float, float]:
     return _direction(node)
 
 
+def _couplings(node: Node) -> tuple[str, ...]:
+    texts = []
+    for item in node.items() if isinstance(node.value, list) else [node]:
+        try:
+            texts.append(str(parse_coupling(item.text())))
+        except InputError as error:
+            raise item.error(error.got, error.expected, error.advice) from None
+    return tuple(texts)
+
+
 def _direction(node: Node) -> tuple[float, float, float]:
     x, y, z = (_plain(item).number() for item in _items(node, (3,)))
     if not any((x, y, z)):
@@ -166,6 +178,7 @@ CELL_KEYS: dict[str, Key] = {
     "targets": Key(
         _rows(_lengths), "[x, y, z], or a list of these [m]", "reflectors in the frame of the last link"
     ),
+    "couple": Key(_couplings, "j3+=j2, or a list of these", "joints that the controller shows beside others"),
     "parameters": Key(_words, "level or names", "what is identified (the robot's own)"),
     "unknown": Key(
         _some_of(("base", "tool", EVERYTHING_KNOWN)), "base, tool, base,tool or none", "places that nobody knows"
@@ -197,6 +210,7 @@ class Cell:
         robot: Path of a URDF or robot YAML, or name of a shipped robot.
         base_link, tip_link: The ends of the chain in a URDF.
         targets: Rows x, y, z of the reflectors in the frame of the last link [m].
+        couple: Joints that the controller shows together with others, ``j3+=j2``.
         parameters: Names, or one level, of the parameters to be identified.
         unknown: ``base``, ``tool``, both, or ``none``.
         payload: Mass [kg], and where its centre of gravity is if that is said [m].
@@ -216,6 +230,7 @@ class Cell:
     base_link: str | None = None
     tip_link: str | None = None
     targets: tuple[tuple[float, ...], ...] | None = None
+    couple: tuple[str, ...] | None = None
     parameters: tuple[str, ...] | None = None
     unknown: tuple[str, ...] | None = None
     payload: tuple[float, ...] | None = None
@@ -239,6 +254,8 @@ class Cell:
             if key == "units":
                 given |= {"--degrees": ()} if "deg" in (value or ()) else {}
                 given |= {"--millimetres": ()} if "mm" in (value or ()) else {}
+            elif key == "couple" and value is not None:
+                given[f"--{key}"] = value
             elif key in ("targets", "test-pose") and value is not None:
                 given[f"--{key}"] = tuple(_joined(row, " ") for row in value)
             elif value is not None:
@@ -257,6 +274,8 @@ class Cell:
         if self.robot is None:
             raise Node(self.path, "robot", None).error("no such key", "this key", "name the robot")
         robot = Robot.load(self.robot, base_link=self.base_link, tip_link=self.tip_link)
+        if self.couple is not None:
+            robot = robot.with_couplings([parse_coupling(text) for text in self.couple])
         if self.targets is not None:
             robot = robot.with_targets(self.targets)
         unknown = [u for u in self.unknown or () if u != EVERYTHING_KNOWN]

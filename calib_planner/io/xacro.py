@@ -103,9 +103,9 @@ def expanded(path: Path, arguments: dict[str, str]) -> str:
     except FileFormatError:
         raise
     except Exception as error:  # xacro lets through whatever the file's own expressions raise
-        fault = error.__cause__ if isinstance(error.__cause__, FileFormatError) else None
-        if fault is not None:
-            raise fault from None
+        inner = getattr(error, "exc", None)
+        if isinstance(inner, FileFormatError):  # of ``find``, in an included file
+            raise inner from None
         reason = " ".join(str(error).split()) or type(error).__name__
         advice = f"arguments follow the file's name: '{path.name} name:=value'" if "arg" in reason else ""
         raise FileFormatError(path, "xacro", reason[:300], "a file that xacro can expand", advice) from None

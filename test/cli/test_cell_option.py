@@ -57,6 +57,9 @@ def test_flags_win(cell: str, tmp_path: Path) -> None:
     (tmp_path / "urdf.yaml").write_text("robot: cell.yaml\ntip-link: tool0\n")
     args = arguments("plan", "--cell", str(tmp_path / "urdf.yaml"), "--configurations", "2", "--robot", "ur10e")
     assert args.robot == "ur10e" and args.tip_link is None, "the link is of the cell's robot"
+    (tmp_path / "coupled.yaml").write_text("robot: planar_2r\ncouple: [q2+=q1]\n")
+    args = arguments("simulate", "--cell", str(tmp_path / "coupled.yaml"), "--plan", "p.csv")
+    assert list(map(str, args.couple)) == ["q2+=q1"]
 
 
 def test_the_same_answer_as_with_the_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -73,11 +73,18 @@ def test_arguments_follow_the_name_and_go_into_the_calibrated_urdf(cell, tmp_pat
         ('<xacro:arg name="length" default="0.5"/>', "", "xacro: .*length.*arguments follow the file's name"),
         ("xacro:arm ", "xacro:leg ", "unknown macro name: xacro:leg"),
         ("arm_macro", "leg_macro", "No such file"),
+        (
+            "my_arm)/urdf/arm",
+            "my_cell)/urdf/more",
+            r"\$\(find elsewhere\): expected a package, got no such package",
+        ),
     ],
 )
 def test_what_xacro_refuses_is_said(cell, old, new, needle):
     pytest.importorskip("xacro")
     cell.write_text(TOP.replace(old, new))
+    more = '<robot xmlns:xacro="x"><xacro:include filename="$(find elsewhere)/x.xacro"/></robot>'
+    (cell.parent / "more_macro.xacro").write_text(more)
     with pytest.raises(FileFormatError, match=needle):
         Robot.load(cell)
 

@@ -37,6 +37,7 @@ from calib_planner.planning.extended import UNCERTAIN, ExtendedModel
 from calib_planner.planning.information import spread_spaces
 from calib_planner.planning.planner import _design_problem, value_of
 from calib_planner.planning.search.exchange import ChoiceProblem, _information, choose
+from calib_planner.robot import Coupling
 from calib_planner.tracker import Isotropic, LaserTracker
 
 POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
@@ -60,6 +61,12 @@ def of(robot: Robot, model: ErrorModel, felt: int = 2) -> tuple[ExtendedModel, n
 CASES = {
     "kuka": (kuka(), typical(Isotropic(3e-5))),
     "slides, two targets, tracker": (mixed().with_parameters("full", ("base", "tool")), typical(TRACKER)),
+    "coupled": (
+        mixed()
+        .with_parameters("full")
+        .with_couplings((Coupling("nod", "turn", 0.25), Coupling("spin", "nod", -0.5))),
+        typical(Isotropic(3e-5)),
+    ),
     "no joint functions": (kuka(), replace(typical(TRACKER), joint_functions=None)),
     "gravity alone": (kuka(), replace(typical(TRACKER), joint_functions=None, visits=None)),
     "smooth": (
