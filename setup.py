@@ -51,6 +51,7 @@ setup(
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
         "docs": ["sphinx>=8.1", "myst-parser>=4", "furo"],
         "bags": ["rosbags"],
+        "files": ["openpyxl"],
         "completion": ["shtab>=1.6"],
         "xacro": ["xacro>=2.1"],
         "threads": ["threadpoolctl>=3.1"],

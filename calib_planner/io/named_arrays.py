@@ -177,6 +177,8 @@ def _lines(
         elif JOINTS.fullmatch(name) or POINTS.fullmatch(name):
             got = f"{name}: {len(array)} rows"
             raise FileFormatError(path, "variables", got, f"{count} rows, as the others", "save as many of each")
+    if len(taken) == 1:  # nothing beside it says which part of it is what
+        taken = {"" if a.shape[1] > 1 else n: a for n, a in taken.items()}
     header: list[str] = []
     for name, array in taken.items():
         header += _column_names(name, array.shape[1])

@@ -125,13 +125,17 @@ def _points_of(
 def _match(
     joints: Table, joint_meaning: Meaning, points: Table, point_meaning: Meaning, stated: str
 ) -> tuple[str, IntArray]:
-    """How the points were matched, and (rows,) the point of each row of joints, −1 for none."""
-    tried = []
+    """How the points were matched, and (rows,) the point of each row of joints, −1 for none.
+
+    Names or times that both files have and that do not agree are said.
+    """
+    tried: list[str] = []
     for how in (stated,) if stated else MATCHES:
         by = {"name": _by_name, "time": _by_time, "order": _by_order}[how]
         rows, why = by(joints, joint_meaning, points, point_meaning)
         if 2 * np.count_nonzero(rows >= 0) >= len(joints):
-            return how, rows
+            disagree = [t for t in tried if not t.split(": ")[1].startswith("no ")]
+            return f"{how} (not {'; '.join(disagree)})" if disagree else how, rows
         tried.append(f"by {how}: {why}")
     advice = f"give both files the same names, or as many rows as {joints.path} has"
     raise FileFormatError(

@@ -274,7 +274,10 @@ class _Sniffer:
             self._check_stated(begin, width)
             names, has_header = list(self.stated), False
         elif header is None:
-            names, has_header = [""] * width, False
+            ended = self.separator != WHITE and all(
+                s.rstrip(" ").endswith(self.separator) for s in self.sample[-2:]
+            )
+            names, has_header = [""] * (width - ended), False  # a separator behind the last cell ends it
         else:
             names, has_header = self._names(*header, width), True
         if len(names) > MAX_COLUMNS:
