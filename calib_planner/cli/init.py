@@ -297,7 +297,8 @@ def _values(args: argparse.Namespace, trial: Trial | None) -> dict[str, Any]:
         if key == "payload":
             value = value[0] if len(value) == 1 else value
         if key == "couple":
-            value = [str(one) for one in value]
+            values[key] = [str(one) for one in value]
+            continue
         if key == "mounting" and value not in ("floor", "ceiling"):
             value = numbers(value)
         values[key] = value

@@ -81,10 +81,12 @@ if TYPE_CHECKING:
         calibrated_urdf,
         parse_speed_limits,
         parse_urdf,
+        read_chain,
         read_speed_limits,
         require_urdf,
         write_calibrated_urdf,
     )
+    from calib_planner.io.urdf_tree import UrdfChain
 else:
     __getattr__, __dir__, __all__ = lazy_door(
         __name__,
@@ -109,8 +111,9 @@ else:
             "open_campaign open_store stored_model",
             "text": "fresh_folder make_folder read_text user_path write_text",
             "understanding": "BagTopics JointTable Reading Source Understanding",
-            "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_speed_limits require_urdf "
+            "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_chain read_speed_limits require_urdf "
             "write_calibrated_urdf",
+            "urdf_tree": "UrdfChain",
         },
         "Robot",
         "URDF_SUFFIXES",

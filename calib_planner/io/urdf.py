@@ -96,6 +96,15 @@ def parse_urdf(text: str, source: str, base_link: str | None = None, tip_link: s
         raise FileFormatError(source, "document", "a xacro file", "plain URDF", advice) from None
 
 
+def read_chain(source: str | Path, base_link: str | None = None, tip_link: str | None = None) -> UrdfChain:
+    """What the file of ``read_urdf`` says of the chain, and what stands beside it.
+
+    Raises:
+        FileFormatError: As ``read_urdf``.
+    """
+    return chain_of(root_of(read_urdf_text(source), str(source)), str(source), base_link, tip_link)
+
+
 def _robot(root: ElementTree.Element, source: str, whole: UrdfChain) -> Robot:
     chain = whole.joints
     moving = [j.name for j in chain if j.moves]

@@ -7,3 +7,4 @@ from calib_planner.report.calibration import InputFile, Provenance, provenance
 from calib_planner.report.page import write_report
 from calib_planner.report.plan_sheet import write_sheet, write_sheet_page
 from calib_planner.report.render import render
+from calib_planner.report.robot_drawing import draw_robot

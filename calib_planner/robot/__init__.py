@@ -15,6 +15,7 @@ from calib_planner.robot.elements import (
     dh_elements,
     dh_levels,
     pose_elements,
+    roll_pitch_yaw,
     rotation,
 )
 from calib_planner.robot.identifiability import NO_LEVER, Identifiability, analyse, describe
