@@ -20,6 +20,12 @@ from calib_planner_paper.two_link import TwoLinkFigure
 BLUE, ORANGE = "#0072B2", "#D55E00"
 """Of the Okabe–Ito palette; they differ in lightness too."""
 
+TITLES = {
+    "figure_2": "Fig. 2: two lengths from two measurements",
+    "figure_3": "Fig. 3: lengths and joint offsets from three measurements",
+    "figure_5": "Fig. 5: simulated calibrations of the KUKA KR 270",
+}
+"""Name of a figure → its title, in the file and on the page."""
 STYLE: dict[str, Any] = {
     "font.size": 10,
     "axes.titlesize": 10,
@@ -82,6 +88,15 @@ def draw_figure_5(result: Figure5, *, narrow: bool = False) -> Figure:
             axes.set_xlabel("experiment number")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=1 if narrow else 3, frameon=False)
+    return figure
+
+
+@in_style
+def titled(figure: Figure, name: str) -> Figure:
+    """The same figure with its title, for a file that stands alone; on the page the heading says it."""
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.35)
+    figure.suptitle(TITLES[name], fontsize=11, fontweight="bold")
     return figure
 
 

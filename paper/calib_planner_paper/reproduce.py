@@ -30,7 +30,7 @@ from calib_planner.io import make_folder, write_text
 from calib_planner.report import render
 from calib_planner.units import signed
 from calib_planner_paper import printed
-from calib_planner_paper.drawing import draw_figure_5, draw_two_link_figure, png, svg
+from calib_planner_paper.drawing import TITLES, draw_figure_5, draw_two_link_figure, png, svg, titled
 from calib_planner_paper.kuka import (
     DRAWN,
     ROBOT,
@@ -153,8 +153,9 @@ def publish(result: Reproduction, folder: str | Path) -> None:
     pictures = {name: (svg(wide), svg(narrow)) for name, (wide, narrow) in drawn.items()}
     for name, (wide, _) in drawn.items():
         try:
-            (target / f"{name}.svg").write_bytes(pictures[name][0])
-            (target / f"{name}.png").write_bytes(png(wide))
+            alone = titled(wide, name)
+            (target / f"{name}.svg").write_bytes(svg(alone))
+            (target / f"{name}.png").write_bytes(png(alone))
         except OSError as error:
             got = f"{target} ({error.strerror or error})"
             raise InputError("output", got, "a folder that can be written", "choose another") from None
@@ -175,6 +176,7 @@ def page(result: Reproduction, pictures: dict[str, tuple[bytes, bytes]]) -> str:
         settings=result.settings,
         random=f"{result.settings.random_plans:,}".replace(",", " "),
         images=images,
+        titles=TITLES,
         drawn=DRAWN,
         columns=result.table_1.columns,
         table_1=_table_1(result.table_1),

@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from calib_planner import Robot
 from calib_planner.cli import main
 from calib_planner_paper import printed
+from calib_planner_paper.drawing import draw_figure_5, draw_two_link_figure, titled
 from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, number, publish, reproduce
 from calib_planner_paper.two_link import FIGURE_2, two_link_figure
 
@@ -280,6 +282,26 @@ def test_files(folder: Path) -> None:
     for name in FILES[:6:2]:
         data = (folder / name).read_bytes()
         assert data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 20_000
+
+
+def test_every_title_is_there_and_within_its_figure(result: Reproduction) -> None:
+    for narrow in (False, True):
+        drawn = {
+            "figure_2": draw_two_link_figure(result.figure_2, narrow=narrow),
+            "figure_3": draw_two_link_figure(result.figure_3, narrow=narrow),
+            "figure_5": draw_figure_5(result.figure_5, narrow=narrow),
+        }
+        for name, figure in drawn.items():
+            if not narrow:
+                titled(figure, name)
+            FigureCanvasAgg(figure).draw()
+            titles = [*([] if narrow else [figure._suptitle]), *(axes.title for axes in figure.axes)]
+            boxes = [t.get_window_extent() for t in titles]
+            assert all(t.get_text() for t in titles) and len(titles) == len(figure.axes) + (not narrow)
+            assert all(
+                box.y1 <= figure.bbox.y1 and box.x1 <= figure.bbox.x1 + 1 and box.x0 >= -1 for box in boxes
+            )
+            assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
 class Page(HTMLParser):
