@@ -12,10 +12,20 @@ that of the tip's frame; ``position_only`` asks for one point only (a target: wh
 and where it is on the calibrated one). That is the right question if the orientation does not
 matter, if the robot has fewer than six joints, or if the orientation of the calibrated tip is not known: a single
 reflector says where a point of the tool is, never how the tool is turned about it.
+
+How accurate that is no solver can say: its residual is rounding. What is expected at a target is the uncertainty
+of what is known, (M3), what the correction leaves out (gravity and joint functions, if placement alone is
+corrected), the repeatability of the robot, and the distance that remains where a target cannot be reached:
+
+    e² = accuracy² + left out² + repeatability² + remaining²     at the reflectors, root mean square.
+
+The base stands where the user registers it, so that accuracy is up to a rigid motion of all targets; for fewer
+than four, or for targets in a plane, it is in the frame of the points.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, check_configurations, check_number, frozen
-from calib_planner.error_model import Knowledge
+from calib_planner.error_model import Knowledge, without_rigid_motion
 from calib_planner.errors import InputError
 from calib_planner.robot import Goals, Robot, goals_of, residuals, solve
 
@@ -63,6 +73,9 @@ class Compensation:
         position_error_before: (N,) the same without correction, calibrated at q [m].
         rotation_error_before: (N,) the same without correction [rad].
         status: N keys of ``STATUS``.
+        expected_error: (N,) root mean square error of the reflectors that is to be expected [m]; NaN where nobody
+            knows.
+        accuracy_frame: ``robot`` or ``world``: what that error is up to; empty where nobody knows it.
     """
 
     joint_names: tuple[str, ...]
@@ -73,6 +86,8 @@ class Compensation:
     position_error_before: FloatArray
     rotation_error_before: FloatArray
     status: tuple[str, ...]
+    expected_error: FloatArray
+    accuracy_frame: str
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -90,6 +105,8 @@ class Compensation:
             "position_error_before": self.position_error_before.tolist(),
             "rotation_error_before": _or_none(self.rotation_error_before),
             "status": list(self.status),
+            "expected_error": _or_none(self.expected_error),
+            "accuracy_frame": self.accuracy_frame or None,
             "reached": int(self.reached.sum()),
         }
 
@@ -104,6 +121,7 @@ def compensate(
     limits: bool = True,
     lever: float = LEVER,
     corrections: Knowledge | None = None,
+    known: Knowledge | None = None,
 ) -> Compensation:
     """Correct joint targets for the difference between the two robots.
 
@@ -117,6 +135,7 @@ def compensate(
             taken for a continuous one, without any.
         lever: What a radian counts beside a metre where not both can be had [m].
         corrections: What the joints do beyond what they read, as learnt together with ``calibrated``.
+        known: What the expected error rests on: ``corrections`` unless they are left out on purpose.
 
     Raises:
         InputError: Other joints, wrong shape, no such target, or a lever that is not positive.
@@ -137,6 +156,12 @@ def compensate(
         corrected = np.clip(corrections.reading(corrected), low, high)
         actual, uncorrected = corrections.actual(corrected), corrections.actual(q)
     after, before = _errors(calibrated, goals, actual), _errors(calibrated, goals, uncorrected)
+    known = corrections if known is None else known
+    expected: FloatArray = np.full(len(q), np.nan)
+    frame = ""
+    if known is not None:
+        left_out = None if corrections is not None else calibrated
+        expected, frame = _expected(known, corrected, after[0], left_out)
     return Compensation(
         joint_names=nominal.joint_names,
         targets=q,
@@ -146,7 +171,35 @@ def compensate(
         position_error_before=before[0],
         rotation_error_before=before[1],
         status=_status(nominal, q, corrected, after, (low, high), limits),
+        expected_error=frozen(expected),
+        accuracy_frame=frame,
     )
+
+
+def _expected(
+    known: Knowledge, q: FloatArray, remaining: FloatArray, alone: Robot | None
+) -> tuple[FloatArray, str]:
+    """(N,) expected error e at readings ``q`` (N, joints) [m], and the frame of the accuracy in it.
+
+    Args:
+        known: What is known of the robot.
+        q: (N, joints) what the joints read.
+        remaining: (N,) distance that the correction leaves [m].
+        alone: The robot, in its own base frame, that was corrected instead of ``known``.
+    """
+    accuracy = known.accuracy(q)
+    with suppress(InputError):  # too few, or in a plane
+        accuracy = known.accuracy(q, "robot")
+    spread = np.trace(known.predict(q).repeatability, axis1=2, axis2=3).mean(axis=1)
+    left_out = np.zeros(len(q))
+    if alone is not None:
+        there = _unplaced(known.placed).positions(known.actual(q))
+        same = alone.with_targets(known.placed.target_offsets).positions(q)
+        apart = there - same
+        if accuracy.kind == "robot":
+            apart = without_rigid_motion(there, apart.reshape(-1, 1)).reshape(there.shape)
+        left_out = np.sum(apart**2, axis=2).mean(axis=1)
+    return np.sqrt(accuracy.per_pose**2 + spread + left_out + remaining**2), accuracy.kind
 
 
 def _point(robot: Robot, position_only: bool, target: int) -> FloatArray:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from calib_planner.cli.arguments import (
     Commands,
+    Group,
     add_command,
     add_reading,
     add_robot,
@@ -27,46 +28,95 @@ from calib_planner.cli.terminal import Terminal
 from calib_planner.compensation import STATUS, Compensation, compensate
 from calib_planner.error_model import Knowledge, Payload
 from calib_planner.errors import InputError
-from calib_planner.io import calibrated_robot, format_table, read_configurations, read_estimate, write_text
+from calib_planner.io import (
+    SavedEstimate,
+    angle_factors,
+    calibrated_robot,
+    format_table,
+    read_configurations,
+    read_estimate,
+    write_text,
+)
 from calib_planner.robot import Robot
+from calib_planner.units import joint_factor, joint_unit
 
-EXAMPLE = """calib-planner compensate --robot arm.urdf --estimate estimate.yaml \\
-      --targets path.csv --output corrected.csv"""
+EXAMPLE = "calib-planner compensate --estimate estimate.yaml --targets path.csv --output corrected.csv"
 
 DESCRIPTION = """Correct joint targets so that the real tool goes where the nominal model says.
 
-The CSV of targets has a column per joint [rad | m], in any order. What is written has the same rows: the
-corrected joints [rad | m], what remains (position_error [m], rotation_error [rad]), and reached: 1, or 0 where
-the row could not be reached exactly and is the closest there is. Joint limits are respected. Where the base
-stands before the tracker plays no part. Gravity and joint functions that the estimate holds are applied: gravity
-for the robot as it was mounted, with the payload that is stated."""
+The CSV of targets has a column per joint [rad | m], in any order, in degrees with --degrees. What is written has
+the same rows in the same units: the corrected joints; expected_error [m], what the reflectors will be off by
+(root mean square) with all that the estimate knows and does not know; and reached: 1, or 0 where the row could not be
+reached exactly and is the closest there is. Joint limits are respected. Where the base stands before the tracker
+plays no part. Gravity and joint functions that the estimate holds are applied: gravity for the robot as it was
+mounted, with the payload that is stated."""
 
-ERRORS = ("position_error", "rotation_error", "reached")
+ADDED = ("expected_error", "reached")
+"""Columns of the output beside the joints."""
 
 
 def add(commands: Commands, summary: str) -> None:
     parser = add_command(commands, "compensate", summary, run, EXAMPLE, DESCRIPTION)
-    add_robot(parser, targets=False)
+    add_robot(parser, "the estimate's", targets=False)
     add_reading(parser)
     what = parser.add_argument_group("what to correct")
     option(what, "--estimate", "FILE", "estimate, written by identify --output", required=True)
     text = "CSV of joint targets [rad | m]"
     option(what, "--targets", "FILE", text, required=True, dest="joint_targets")
-    switch(what, "--position-only", "only the position of a point counts, not how the tool is turned")
-    text = "that point, in the frame of the last link [m] (the first reflector, as identified)"
-    option(what, "--tool", '"x y z"', text, kind=numbers)
-    add_payload(what, "the one that the estimate was made with")
-    text = "placement alone, without gravity and joint functions: what a calibrated URDF does"
-    switch(what, "--geometry-only", text)
-    switch(what, "--ignore-limits", "joint limits do not matter")
+    add_correction(what)
     add_seed(parser)
     option(parser, "--output", "FILE", "CSV of corrected targets (stdout without --json)")
 
 
+def add_correction(group: Group) -> None:
+    """How joint targets are corrected."""
+    switch(group, "--position-only", "only the position of a point counts, not how the tool is turned")
+    text = "that point, in the frame of the last link [m] (the first reflector, as identified)"
+    option(group, "--tool", '"x y z"', text, kind=numbers)
+    add_payload(group, "the one that the estimate was made with")
+    text = "placement alone, without gravity and joint functions: what a calibrated URDF does"
+    switch(group, "--geometry-only", text)
+    switch(group, "--ignore-limits", "joint limits do not matter")
+
+
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
-    nominal = load_robot(args)
     saved = read_estimate(args.estimate)
-    errors = None if args.geometry_only or saved.learnt is None else _carrying(args, saved.knowledge(nominal))
+    nominal = robot_of(args, saved)
+    result = corrected(args, saved, nominal, args.joint_targets, terminal)
+    if args.output:
+        write_text(args.output, corrected_text(result, nominal, degrees=args.degrees), "--output")
+    elif not args.json:
+        print(corrected_text(result, nominal, degrees=args.degrees), end="")
+    plainly = args.geometry_only or saved.learnt is None
+    answer = {
+        "robot": nominal.name,
+        **result.to_dict(),
+        "position_only": args.position_only,
+        "error_model": None if plainly else {"terms": saved.document["error_model"]["terms"]},
+        "output": args.output,
+    }
+    if args.json:
+        terminal.answer(answer, lambda console: None)
+    else:
+        show_compensation(result, nominal, terminal.out if args.output else terminal.err)
+    tell_compensation(args, saved, result, terminal)
+
+
+def robot_of(args: argparse.Namespace, saved: SavedEstimate) -> Robot:
+    """The nominal robot of --robot, or the one that the estimate holds."""
+    return saved.nominal_robot() if args.robot is None else load_robot(args)
+
+
+def corrected(
+    args: argparse.Namespace, saved: SavedEstimate, nominal: Robot, targets: str, terminal: Terminal
+) -> Compensation:
+    """The joint targets of a file, corrected as the options of ``add_correction`` say.
+
+    Raises:
+        InputError, FileFormatError: As ``compensate``, and where an option does not fit another.
+    """
+    known = None if saved.learnt is None else _carrying(args, saved.knowledge(nominal))
+    errors = None if args.geometry_only else known
     if errors is None and args.payload is not None:
         got = "--geometry-only beside it" if args.geometry_only else "an estimate without an error model"
         raise InputError("--payload", got, "an estimate by an error model, and its gravity")
@@ -76,33 +126,25 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         nominal = nominal.with_targets(calibrated.target_offsets)
     if args.tool is not None:
         nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
-    q = read_configurations(args.joint_targets, nominal, reading_of(args, terminal))
+    q = read_configurations(targets, nominal, reading_of(args, terminal))
     with terminal.working("correcting"):
-        result = compensate(
+        return compensate(
             nominal,
             calibrated,
             q,
             position_only=args.position_only,
             limits=not args.ignore_limits,
             corrections=errors,
+            known=known,
         )
-    if args.output:
-        write_text(args.output, _csv(result), "--output")
-    elif not args.json:
-        print(_csv(result), end="")
-    answer = {
-        "robot": nominal.name,
-        **result.to_dict(),
-        "position_only": args.position_only,
-        "error_model": None if errors is None else {"terms": saved.document["error_model"]["terms"]},
-        "output": args.output,
-    }
-    if args.json:
-        terminal.answer(answer, lambda console: None)
-    else:
-        show_compensation(result, terminal.out if args.output else terminal.err)
+
+
+def tell_compensation(
+    args: argparse.Namespace, saved: SavedEstimate, result: Compensation, terminal: Terminal
+) -> None:
+    """Say what is not as it should be."""
     if saved.learnt is None and not args.geometry_only:
-        terminal.note(f"{args.estimate}: {_without_model(saved.document)}")
+        terminal.note(f"{saved.path}: {_without_model(saved.document)}")
     for status, count in Counter(result.status).items():
         if status != "reached":
             terminal.note(f"{count} of {len(result.status)} targets {status}: {STATUS[status]}")
@@ -135,27 +177,31 @@ def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:
     return robot.with_targets([args.tool])
 
 
-def _csv(result: Compensation) -> str:
-    errors = [result.position_error, result.rotation_error]
-    rows: list[list[Any]] = np.column_stack([result.corrected, *errors]).tolist()
+def corrected_text(result: Compensation, robot: Robot, *, degrees: bool) -> str:
+    """CSV of the corrected targets, angles in degrees if those of the input were."""
+    joints = result.corrected / angle_factors(robot, degrees=degrees)
+    rows: list[list[Any]] = np.column_stack([joints, result.expected_error]).tolist()
     for row, reached in zip(rows, result.reached.tolist(), strict=True):
         row.append(int(reached))
-    return format_table([*result.joint_names, *ERRORS], rows)
+    return format_table([*result.joint_names, *ADDED], rows)
 
 
-def show_compensation(result: Compensation, console: Console) -> None:
-    """Print what the correction does, in mm and mrad."""
-    table = Table("tool against nominal", title=f"{len(result.status)} targets")
+def show_compensation(result: Compensation, robot: Robot, console: Console) -> None:
+    """Print what the correction does and how accurate it will be."""
+    table = Table("", title=f"{len(result.status)} targets, {int(result.reached.sum())} reached")
     for column in ("mean", "largest"):
         table.add_column(column, justify="right")
     rows = [
-        ("position uncorrected [mm]", result.position_error_before),
-        ("position corrected [mm]", result.position_error),
-        ("rotation uncorrected [mrad]", result.rotation_error_before),
-        ("rotation corrected [mrad]", result.rotation_error),
-        ("joint correction [mrad | mm]", np.abs(result.corrected - result.targets).max(axis=1)),
+        ("tool off its nominal place without correction [mm]", 1e3 * result.position_error_before),
+        ("tool turned from it [mrad]", 1e3 * result.rotation_error_before),
+        ("error to be expected with it, rms [mm]", 1e3 * result.expected_error),
     ]
+    change = np.abs(result.corrected - result.targets)
+    for turns in (True, False):
+        if (robot.joint_is_revolute == turns).any():
+            moved = joint_factor(turns) * change[:, robot.joint_is_revolute == turns].max(axis=1)
+            rows.append((f"joint correction [{joint_unit(turns)}]", moved))
     for label, values in rows:
         if not np.isnan(values).any():
-            table.add_row(label, *(f"{1e3 * v:.4g}" for v in (values.mean(), values.max())))
+            table.add_row(label, *(f"{v:.4g}" for v in (values.mean(), values.max())))
     console.print(table)

@@ -417,7 +417,7 @@ def write_outputs(args: argparse.Namespace, problem: IdentificationProblem, esti
     """Write the files that the options name; the answer's keys about them."""
     robot = estimate.calibrated
     if args.output:
-        write_estimate(args.output, estimate, "--output")
+        write_estimate(args.output, estimate, "--output", problem)
     if args.report:
         from calib_planner.report import (  # 0.1 s for templates, which only a report needs
             provenance,

@@ -38,6 +38,7 @@ COMMANDS = {
         "calib_planner.cli.compensate",
         "joint targets corrected for a nominal controller",
     ),
+    "export": ("calib_planner.cli.export", "URDF, kinematics, report and corrected targets of an estimate"),
     "simulate": ("calib_planner.cli.simulate", "measure a plan with a simulated robot"),
     "robots": ("calib_planner.cli.robots", "list the shipped robots, or show one"),
     "completion": ("calib_planner.cli.completion", "print the script that completes words in bash or zsh"),

@@ -21,6 +21,7 @@ from calib_planner.identification.estimate import (
     Points,
     Reason,
     Residuals,
+    ResidualStatistics,
     Validation,
     Verdict,
     chance_of,

@@ -26,7 +26,13 @@ if TYPE_CHECKING:
         with_units,
     )
     from calib_planner.io.error_model import read_error_model, write_error_model
-    from calib_planner.io.estimate import calibrated_robot, placement, read_estimate, write_estimate
+    from calib_planner.io.estimate import (
+        SavedEstimate,
+        calibrated_robot,
+        placement,
+        read_estimate,
+        write_estimate,
+    )
     from calib_planner.io.kinematics import read_kinematics, write_kinematics
     from calib_planner.io.plan import (
         SHARE,
@@ -98,7 +104,7 @@ else:
             "data": "angle_factors in_units is_bag read_configurations read_data read_joints read_plan_csv "
             "with_units",
             "error_model": "read_error_model write_error_model",
-            "estimate": "calibrated_robot placement read_estimate write_estimate",
+            "estimate": "SavedEstimate calibrated_robot placement read_estimate write_estimate",
             "kinematics": "read_kinematics write_kinematics",
             "plan": "SHARE SHEET_FILES WORDS read_plan robot_pace write_plan write_sheet_csv write_sheet_yaml "
             "write_trajectory",

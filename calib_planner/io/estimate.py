@@ -19,6 +19,9 @@ from which their parameters are deviations, and
     covariance: text           # lower triangle, row by row, as base64 of little-endian doubles
     hidden: [[...], ...]       # directions of β that nothing shows
 
+``problem`` holds the measurements and the robot's file, if the writer had them (see ``io.problem``). With it the
+whole ``Estimate`` comes back, so that everything made of it can be made again without another fit.
+
 A chain begins with the base's pose, T(x, y, z) Rz(yaw) Ry(pitch) Rx(roll) Rx(rx) Ry(ry) Rz(rz): roll, pitch and
 yaw are the closed form's orientation, and rx, ry and rz what was identified beyond it.
 """
@@ -38,8 +41,27 @@ import numpy as np
 from calib_planner.arrays import FloatArray, frozen, plain
 from calib_planner.error_model import ErrorModel, Knowledge, from_mapping
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.identification import ChiSquare, Estimate, PointNoise, Reason, Verdict
+from calib_planner.identification import (
+    Accuracy,
+    Alternative,
+    ChiSquare,
+    Estimate,
+    IdentificationProblem,
+    LeftOutError,
+    Observability,
+    ParameterFit,
+    PointNoise,
+    Points,
+    Reason,
+    Residuals,
+    ResidualStatistics,
+    TermGain,
+    Validation,
+    Verdict,
+)
+from calib_planner.io.problem import problem_mapping, saved_problem, saved_robot, urdf_text
 from calib_planner.io.yaml import Node, read_document, write_document
+from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot, is_nuisance
 from calib_planner.units import listed
 
@@ -62,19 +84,32 @@ UNLIMITED = {
 """Key → field of ``Accuracy`` that can be infinite; JSON has no word for that, YAML has."""
 
 
-def write_estimate(path: str | Path, estimate: Estimate | SavedEstimate, field: str = "output") -> None:
+def write_estimate(
+    path: str | Path,
+    estimate: Estimate | SavedEstimate,
+    field: str = "output",
+    problem: IdentificationProblem | None = None,
+) -> None:
     """Write an estimate, [m] and [rad], or one that was read.
+
+    Args:
+        path: The file.
+        estimate: The estimate.
+        field: The argument or option that named the path, for the error.
+        problem: What it answers; without it no report can be made of the file.
 
     Raises:
         InputError: The path cannot be written; names ``field``.
     """
-    content = estimate.document if isinstance(estimate, SavedEstimate) else document_of(estimate)
+    content = estimate.document if isinstance(estimate, SavedEstimate) else document_of(estimate, problem)
     write_document(path, "estimate", content, field)
 
 
-def document_of(estimate: Estimate) -> dict[str, Any]:
+def document_of(estimate: Estimate, problem: IdentificationProblem | None = None) -> dict[str, Any]:
     """What ``write_estimate`` writes, without its format line, as plain values."""
     content = estimate.to_dict()
+    if problem is not None:
+        content["problem"] = problem_mapping(problem) | {"spare": estimate.residuals.spare}
     unlimited = {key: getattr(estimate.accuracy, name) for key, name in UNLIMITED.items() if key in content}
     content["error_model"] |= plain(_knowledge_mapping(estimate.knowledge))
     couple = [str(one) for one in estimate.calibrated.couplings]
@@ -150,6 +185,7 @@ def parse_estimate(top: Node) -> SavedEstimate:
         placement_alone=_placement_alone(top, names),
         learnt=_learnt(top.get("error_model")),
         document=dict(top.value),
+        path=str(top.path),
     )
 
 
@@ -289,6 +325,7 @@ class SavedEstimate:
         learnt: What predicts, or ``None`` in older files.
         document: Everything that the file holds, as plain values.
         couple: Joints that the controller shows against others, ``j3+=j2``.
+        path: The file.
     """
 
     robot: str
@@ -312,6 +349,55 @@ class SavedEstimate:
     learnt: SavedKnowledge | None
     document: dict[str, Any]
     couple: tuple[str, ...] = ()
+    path: str = ""
+
+    def nominal_robot(self) -> Robot:
+        """The nominal robot, from the file alone, with its nominal targets.
+
+        Raises:
+            FileFormatError: The file does not hold it.
+        """
+        return saved_robot(self._problem)
+
+    def nominal_urdf(self) -> str:
+        """The text of the nominal robot's URDF, from the file alone.
+
+        Raises:
+            FileFormatError: The file does not hold it.
+        """
+        return urdf_text(self._problem)
+
+    def problem(self, robot: Robot) -> IdentificationProblem:
+        """The problem that it answers, for the nominal ``robot``; what a prior said is in the error model.
+
+        Raises:
+            FileFormatError: The file does not hold it.
+            InputError, UnknownNameError: As ``knowledge``.
+        """
+        self.check_robot(robot)
+        model = self.knowledge(robot).model
+        node = self._problem
+        targets = node["targets"].array((None, 3))
+        alike = replace(robot.with_targets(targets), parameter_names=self.parameters)
+        part = Node(node.path, node.where, {k: v for k, v in node.value.items() if k != "spare"})
+        return saved_problem(part, alike, model)
+
+    def estimate(self, robot: Robot) -> Estimate:
+        """The whole estimate again, for the nominal ``robot``.
+
+        Raises:
+            FileFormatError: The file does not hold what it takes: it is of an older version.
+            InputError, UnknownNameError: As ``knowledge``.
+        """
+        return _whole(self, robot)
+
+    @property
+    def _problem(self) -> Node:
+        node = Node(self.path, "problem", self.document.get("problem"))
+        if node.value is None:
+            advice = "identify again; or give the robot with --robot for all but the report"
+            raise node.error("nothing", "the measurements and the robot's file", advice)
+        return node.mapping(None, ("robot", "targets"))
 
     def calibrated(self, robot: Robot) -> Robot:
         """The nominal ``robot`` with all identified values, base and targets too: ``Estimate.calibrated`` again.
@@ -384,6 +470,101 @@ class SavedEstimate:
     def chain_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are neither the base's nor the targets'."""
         return tuple(n for n in self.parameters if not is_nuisance(n))
+
+
+def _whole(saved: SavedEstimate, robot: Robot) -> Estimate:
+    """The estimate from the keys of its document, which are those of ``Estimate.to_dict``."""
+    top = Node(saved.path, "", saved.document)
+    needed = ("residuals", "normalised_residuals", "left_out", "placement_alone", "rejected", "suspects", "rank")
+    top.mapping(None, (*needed, "problem", "alternatives", "residual_before", "residual_after", "chi_square"))
+    problem, known = saved.problem(robot), saved.knowledge(robot)
+    alone, shape = top["placement_alone"], problem.data.p.shape
+    test_poses = problem.test_pose_array
+
+    def per_pose(key: str) -> FloatArray:
+        values = top.get(key, []).value if len(test_poses) else []
+        return Node(saved.path, key, values).array((len(test_poses),), finite=False)
+
+    def statistics(node: Node) -> ResidualStatistics:
+        return _field(node, ResidualStatistics)
+
+    return top.build(
+        lambda: Estimate(
+            calibrated=saved.calibrated(robot),
+            knowledge=known,
+            fit=ParameterFit(
+                saved.parameters,
+                saved.units,
+                saved.nominal,
+                saved.deviations,
+                saved.std,
+                saved.covariance,
+                top["iterations"].of_kind("int"),
+                saved.status,
+            ),
+            observability=Observability(
+                rank=top["rank"].of_kind("int"),
+                fixed=tuple(row["parameter"] for row in top["unidentifiable"].value),
+                unidentifiable=tuple(row["combination"] for row in top["unidentifiable"].value),
+                resolved_by_prior=top["resolved_by_prior"].of_kind("tuple[str, ...]"),
+                nearly_dependent=top["nearly_dependent"].of_kind("tuple[str, ...]"),
+                prior=str(top["prior"].value or ""),
+            ),
+            points=Points(
+                measured=top["measurements"].of_kind("int"),
+                used=top["used"].of_kind("int"),
+                rejected=_fields(top["rejected"], RejectedPoint),
+                suspects=_fields(top["suspects"], RejectedPoint),
+                copies=top["copies"].of_kind("int"),
+                moved_since=top["moved_since"].value,
+            ),
+            residuals=Residuals(
+                vectors=top["residuals"].array(shape, finite=False),
+                normalised=top["normalised_residuals"].array(shape[:2], finite=False),
+                gate=_float(top["gate"]),
+                before=statistics(top["residual_before"]),
+                after=statistics(top["residual_after"]),
+                placement_alone=statistics(alone["residual_after"]),
+                sigma=_float(top["sigma_estimate"]),
+                spare=_float(top["problem"].get("spare")),
+                chi_square=saved.chi_square or ChiSquare(np.nan, 0),
+            ),
+            noise=saved.noise or PointNoise(saved.sigma, "residuals"),
+            accuracy=Accuracy(
+                test_poses=test_poses,
+                predicted=per_pose(PER_POSE),
+                placement=per_pose("placement_accuracy_per_test_pose"),
+                knowledge=known,
+                frame=problem.accuracy_frame,
+                required=np.nan if problem.required_accuracy is None else problem.required_accuracy,
+            ),
+            left_out=_field(top["left_out"], LeftOutError),
+            placement_alone=_field(alone["left_out"], LeftOutError),
+            terms=_fields(top["error_model"]["terms"], TermGain),
+            alternatives=_fields(top["alternatives"], Alternative),
+            seconds=_float(top["seconds"]),
+            validation=_field(top["validation"], Validation) if "validation" in top else None,
+            verdict=saved.verdict or Verdict("FAIL", ()),
+        )
+    )
+
+
+def _field(node: Node, kind: type[T]) -> T:
+    """A dataclass from the mapping of its fields; null is NaN, or ``None`` where a field can be that."""
+    node.mapping()
+    values: dict[str, Any] = {}
+    for f in fields(kind):  # type: ignore[arg-type]
+        if f.name in node:
+            value = node[f.name].value
+            value = np.nan if value is None and f.type == "float" else value
+            values[f.name] = tuple(value) if isinstance(value, list) else value
+        elif f.default is MISSING:
+            raise node.error(f"no key {f.name!r}", "what identify wrote", "identify again")
+    return kind(**values)
+
+
+def _fields(node: Node, kind: type[T]) -> tuple[T, ...]:
+    return tuple(_field(item, kind) for item in node.items()) if node.value else ()
 
 
 def _put(robot: Robot, base: FloatArray, targets: FloatArray) -> Robot:

@@ -42,9 +42,10 @@ from pathlib import Path
 import numpy as np
 
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
+from calib_planner.io.text import read_text
 from calib_planner.io.urdf import read_urdf
 from calib_planner.io.xacro import split_arguments
-from calib_planner.io.yaml import Node, read_yaml
+from calib_planner.io.yaml import Node, parse_yaml
 from calib_planner.robot import (
     KINDS,
     ROW_TYPES,
@@ -66,6 +67,7 @@ from calib_planner.robot import (
 URDF_SUFFIXES = (".urdf", ".xml", ".xacro", ".sdf")
 """Files that are read as URDF; what is another format after all is told so by its content."""
 YAML_SUFFIXES = (".yaml", ".yml")
+ROBOT_YAML = "readable YAML of a robot"
 CHAINS = ("elements", "dh", "modified_dh")
 LEVELS = ("lengths", "offsets", "levels")
 KEYS = ("name", "description", "joints", *CHAINS, "targets", "base", *LEVELS, "couple", "masses")
@@ -126,7 +128,12 @@ def read_robot_yaml(path: Path) -> Robot:
     Raises:
         FileFormatError: Names the key at fault, what it holds and what is valid.
     """
-    top = read_yaml(path, "readable YAML of a robot").mapping(KEYS, ("joints",))
+    return parse_robot_yaml(read_text(path, ROBOT_YAML), path)
+
+
+def parse_robot_yaml(text: str, path: Path) -> Robot:
+    """Like ``read_robot_yaml``, from a text that stood in the file ``path``."""
+    top = parse_yaml(text, path, ROBOT_YAML).mapping(KEYS, ("joints",))
     try:
         return _robot(top)
     except FileFormatError:

@@ -135,6 +135,7 @@ def _robot(root: ElementTree.Element, source: str, whole: UrdfChain) -> Robot:
             parameter_names=(*lengths, *offsets),
             source=source,
             from_urdf=True,
+            links=(whole.base, whole.tip),
             link_masses=_link_masses(whole, moving),
             remarks=whole.remarks,
         )

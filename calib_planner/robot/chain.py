@@ -66,6 +66,7 @@ class Robot:
         parameter_names: Active parameters, the order of all Jacobian columns.
         source: What the robot was read from.
         from_urdf: Whether it was read from a URDF, that is from the description of a real robot.
+        links: Base link and tip link of the chain in its URDF; empty otherwise.
         link_masses: What its file says of the masses of its links; see ``mass_fault``.
         remarks: What is odd in its file, or was chosen when it was read, sentences without a full stop.
         couplings: Joints that the controller shows against others; see ``coupling``. All coordinates are then
@@ -82,6 +83,7 @@ class Robot:
     parameter_names: tuple[str, ...] = ()
     source: str = ""
     from_urdf: bool = False
+    links: tuple[str, ...] = ()
     link_masses: tuple[LinkMass, ...] = ()
     remarks: tuple[str, ...] = ()
     couplings: tuple[Coupling, ...] = ()
