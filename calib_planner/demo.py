@@ -154,7 +154,7 @@ def run_demo(
     )
     write_plan(folder / "plan.yaml", best)
     write_measurements(folder / "measurements.csv", data)
-    write_estimate(folder / "estimate.yaml", estimate)
+    write_estimate(folder / "estimate.yaml", estimate, problem=measured)
     files: list[tuple[str, str | Path]] = [("robot", ROBOT), ("data", folder / "measurements.csv")]
     made = provenance(files, seed=settings.seed, estimate=str(folder / "estimate.yaml"))
     write_report(folder / PAGE, measured, estimate, made)

@@ -44,12 +44,12 @@ EXAMPLE = "calib-planner compensate --estimate estimate.yaml --targets path.csv 
 
 DESCRIPTION = """Correct joint targets so that the real tool goes where the nominal model says.
 
-The CSV of targets has a column per joint [rad | m], in any order, in degrees with --degrees. What is written has
-the same rows in the same units: the corrected joints; expected_error [m], what the reflectors will be off by
-(root mean square) with all that the estimate knows and does not know; and reached: 1, or 0 where the row could not be
-reached exactly and is the closest there is. Joint limits are respected. Where the base stands before the tracker
-plays no part. Gravity and joint functions that the estimate holds are applied: gravity for the robot as it was
-mounted, with the payload that is stated."""
+The CSV of targets has a column per joint [rad | m], in any order, in degrees with --degrees. What is written
+has the same rows in the same units: the corrected joints; expected_error [m], what the reflectors will be off
+by (root mean square) with all that the estimate knows and does not know; and reached: 1, or 0 where the row
+could not be reached exactly and is the closest there is. Joint limits are respected. Where the base stands
+before the tracker plays no part. Gravity and joint functions that the estimate holds are applied: gravity for
+the robot as it was mounted, with the payload that is stated."""
 
 ADDED = ("expected_error", "reached")
 """Columns of the output beside the joints."""

@@ -54,7 +54,7 @@ DESCRIPTION = """Write cell.yaml: robot, reflectors, what is unknown, payload, m
 
 Without --robot on a terminal it asks; Enter leaves a question open. With --data it tries the cell at once: it
 says what it understood of the file, and whether the points agree with the robot once base and reflectors are
-placed. Every command then takes --cell cell.yaml; docs/reference/cell.md lists the keys."""
+placed. Every command then takes the file for its options; docs/reference/cell.md lists the keys."""
 AGREES = 0.02
 """Median distance up to which points agree with a robot that is placed, as ``find_misplacement`` has it [m]:
 nominal arms err by a few millimetres."""

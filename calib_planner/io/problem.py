@@ -110,7 +110,7 @@ def saved_problem(node: Node, robot: Robot, model: ErrorModel) -> Identification
     Args:
         node: What ``problem_mapping`` wrote.
         robot: The nominal robot, with the parameters of the estimate.
-        model: How the estimate found the robot and the measurement to err; it holds the instrument.
+        model: How robot and measurement err by the estimate; it holds the instrument.
 
     Raises:
         FileFormatError: The part of the file is not what was written.

@@ -193,6 +193,7 @@ COMMANDS = (
     "compare",
     "identify",
     "compensate",
+    "export",
     "simulate",
     "robots",
     "completion",
@@ -362,6 +363,11 @@ def _others() -> list[Case]:
         Case("campaign_goes_on", f"{by_hand} --measured kuka_new.csv --next n.csv", ("n.csv",)),
         Case("campaign_ends", f"{easy} --measured kuka_points.csv --held-out kuka_new.csv --validation 4"),
         Case("compensate", f"{compensate} --output o.csv", ("o.csv",)),
+        Case(
+            "export",
+            "export arm_estimate.yaml --urdf c.urdf --kinematics k.yaml --targets arm_new.csv o.csv",
+            ("c.urdf", "k.yaml", "o.csv"),
+        ),
         Case("compensate_position", f"{compensate} --position-only --tool '0.1 0 0' --ignore-limits"),
         Case(
             "compensate_kuka",

@@ -59,6 +59,10 @@ WORDS = {
     "sha256": "of an input file: another last digit of a simulated measurement is another hash",
     "id": "of a plan sheet: a hash of all its numbers",
     "hash": "of a kinematics file: the same",
+    **dict.fromkeys(
+        ("covariance", "configurations", "points", "std", "payload"),
+        "in an estimate file, numbers in base64: another last digit is another text",
+    ),
     "description": "of a node's parameter",
     "additional_constraints": "of a node's parameter, in words; its choices stand beside it",
 }
