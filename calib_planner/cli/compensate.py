@@ -30,29 +30,28 @@ from calib_planner.error_model import Knowledge, Payload
 from calib_planner.errors import InputError
 from calib_planner.io import (
     SavedEstimate,
-    angle_factors,
+    Understanding,
     calibrated_robot,
     format_table,
-    read_configurations,
+    in_units,
     read_estimate,
+    read_joints,
+    with_units,
     write_text,
 )
 from calib_planner.robot import Robot
-from calib_planner.units import joint_factor, joint_unit
+from calib_planner.units import LENGTHS, joint_factor, joint_unit
 
 EXAMPLE = "calib-planner compensate --estimate estimate.yaml --targets path.csv --output corrected.csv"
 
 DESCRIPTION = """Correct joint targets so that the real tool goes where the nominal model says.
 
-The CSV of targets has a column per joint [rad | m], in any order, in degrees with --degrees. What is written
-has the same rows in the same units: the corrected joints; expected_error [m], what the reflectors will be off
-by (root mean square) with all that the estimate knows and does not know; and reached: 1, or 0 where the row
+The table of targets has a column per joint [rad | m], in any order and in any units. What is written has the
+same rows in the same units: the corrected joints; expected_error [m], what the reflectors will be off by
+(root mean square) with all that the estimate knows and does not know; and reached: 1, or 0 where the row
 could not be reached exactly and is the closest there is. Joint limits are respected. Where the base stands
 before the tracker plays no part. Gravity and joint functions that the estimate holds are applied: gravity for
 the robot as it was mounted, with the payload that is stated."""
-
-ADDED = ("expected_error", "reached")
-"""Columns of the output beside the joints."""
 
 
 def add(commands: Commands, summary: str) -> None:
@@ -82,11 +81,11 @@ def add_correction(group: Group) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     saved = read_estimate(args.estimate)
     nominal = robot_of(args, saved)
-    result = corrected(args, saved, nominal, args.joint_targets, terminal)
+    result, file = corrected(args, saved, nominal, args.joint_targets, terminal)
     if args.output:
-        write_text(args.output, corrected_text(result, nominal, degrees=args.degrees), "--output")
+        write_text(args.output, corrected_text(result, nominal, file), "--output")
     elif not args.json:
-        print(corrected_text(result, nominal, degrees=args.degrees), end="")
+        print(corrected_text(result, nominal, file), end="")
     plainly = args.geometry_only or saved.learnt is None
     answer = {
         "robot": nominal.name,
@@ -109,8 +108,8 @@ def robot_of(args: argparse.Namespace, saved: SavedEstimate) -> Robot:
 
 def corrected(
     args: argparse.Namespace, saved: SavedEstimate, nominal: Robot, targets: str, terminal: Terminal
-) -> Compensation:
-    """The joint targets of a file, corrected as the options of ``add_correction`` say.
+) -> tuple[Compensation, Understanding]:
+    """The joint targets of a file, corrected as the options of ``add_correction`` say, and what the file is like.
 
     Raises:
         InputError, FileFormatError: As ``compensate``, and where an option does not fit another.
@@ -126,17 +125,18 @@ def corrected(
         nominal = nominal.with_targets(calibrated.target_offsets)
     if args.tool is not None:
         nominal, calibrated = _with_tool(args, nominal), _with_tool(args, calibrated)
-    q = read_configurations(targets, nominal, reading_of(args, terminal))
+    table = read_joints(targets, nominal, reading_of(args, terminal))
     with terminal.working("correcting"):
-        return compensate(
+        result = compensate(
             nominal,
             calibrated,
-            q,
+            table.configurations,
             position_only=args.position_only,
             limits=not args.ignore_limits,
             corrections=errors,
             known=known,
         )
+    return result, table.understanding
 
 
 def tell_compensation(
@@ -177,13 +177,16 @@ def _with_tool(args: argparse.Namespace, robot: Robot) -> Robot:
     return robot.with_targets([args.tool])
 
 
-def corrected_text(result: Compensation, robot: Robot, *, degrees: bool) -> str:
-    """CSV of the corrected targets, angles in degrees if those of the input were."""
-    joints = result.corrected / angle_factors(robot, degrees=degrees)
-    rows: list[list[Any]] = np.column_stack([joints, result.expected_error]).tolist()
+def corrected_text(result: Compensation, robot: Robot, file: Understanding) -> str:
+    """CSV of the corrected targets in the units of ``file``, which the header names if it did there."""
+    units, metre = file.units, LENGTHS[file.units.length or "m"]
+    joints = in_units(robot, result.corrected, units)
+    rows: list[list[Any]] = np.column_stack([joints, result.expected_error / metre]).tolist()
     for row, reached in zip(rows, result.reached.tolist(), strict=True):
         row.append(int(reached))
-    return format_table([*result.joint_names, *ADDED], rows)
+    names = with_units(robot, units) if file.angle_from == "written" else result.joint_names
+    error = "expected_error" if metre == 1.0 else f"expected_error [{units.length}]"
+    return format_table([*names, error, "reached"], rows)
 
 
 def show_compensation(result: Compensation, robot: Robot, console: Console) -> None:

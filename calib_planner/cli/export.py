@@ -83,8 +83,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     result = None
     if args.joint_targets:
         targets, output = args.joint_targets
-        result = corrected(args, saved, nominal, targets, terminal)
-        write_text(output, corrected_text(result, nominal, degrees=args.degrees), "--targets")
+        result, file = corrected(args, saved, nominal, targets, terminal)
+        write_text(output, corrected_text(result, nominal, file), "--targets")
         written["targets"] = output
     more: dict[str, Any] = {"written": written}
     more |= {"compensation": result.to_dict()} if result is not None else {}

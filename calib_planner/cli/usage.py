@@ -93,6 +93,8 @@ def with_cell(top: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
     taken = given.union(*(group for group in either if group & given))
     if "--robot" in given:  # links are of the cell's robot
         taken |= {"--base-link", "--tip-link", "--couple"}
+    if "--units" in given:
+        taken |= {"--degrees", "--millimetres"}
     added: list[str] = []
     for flag, values in cell.options().items():
         action = command._option_string_actions.get(flag)

@@ -62,7 +62,7 @@ from calib_planner.identification import (
 from calib_planner.io.problem import problem_mapping, saved_problem, saved_robot, urdf_text
 from calib_planner.io.yaml import Node, read_document, write_document
 from calib_planner.measurements import RejectedPoint
-from calib_planner.robot import Robot, is_nuisance
+from calib_planner.robot import Robot, is_nuisance, parse_coupling
 from calib_planner.units import listed
 
 T = TypeVar("T")
@@ -357,7 +357,8 @@ class SavedEstimate:
         Raises:
             FileFormatError: The file does not hold it.
         """
-        return saved_robot(self._problem)
+        robot = saved_robot(self._problem)
+        return robot.with_couplings([parse_coupling(text) for text in self.couple])
 
     def nominal_urdf(self) -> str:
         """The text of the nominal robot's URDF, from the file alone.

@@ -53,6 +53,8 @@ def test_flags_win(cell: str, tmp_path: Path) -> None:
     assert args.robot == "kuka_kr270"
     assert arguments(*words, "--instrument", "i.yaml").sigma is None, "which is stated in place of the noise"
     assert arguments(*words, "--vertical", "0 0 1").mounting is None
+    args = arguments(*words, "--units", "m,rad")
+    assert not args.degrees and not args.millimetres
     assert arguments("robots", "show", "ur10e", "--cell", cell).robot == "ur10e"
     (tmp_path / "urdf.yaml").write_text("robot: cell.yaml\ntip-link: tool0\n")
     args = arguments("plan", "--cell", str(tmp_path / "urdf.yaml"), "--configurations", "2", "--robot", "ur10e")

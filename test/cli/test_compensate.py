@@ -14,6 +14,7 @@ from calib_planner import Robot
 from calib_planner.cli import main
 from calib_planner.error_model import typical, without_rigid_motion
 from calib_planner.io import (
+    Reading,
     calibrated_robot,
     read_configurations,
     read_estimate,
@@ -22,6 +23,7 @@ from calib_planner.io import (
 )
 from calib_planner.io.yaml import write_document
 from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.units import Units
 
 OFFSETS = {"turn.offset": 1e-3, "slide.offset": -2e-3, "spin.offset": 5e-3, "nod.offset": -4e-3}
 Q = [[0.1, 0.2, 0.3, 0.4], [-0.5, 0.0, 2.0, -0.6]]
@@ -95,8 +97,23 @@ def test_degrees_and_a_point_of_the_tool(
     assert np.abs(gap).max() < 1e-9
     written = str(tmp_path / "corrected.csv")
     assert main(words(cell | {"--targets": str(path)}, *more, "--output", written)) == 0
-    again = read_configurations(written, nominal, degrees=True)
+    again = read_configurations(written, nominal, Reading(otherwise=Units(angle="deg")))
     np.testing.assert_allclose(again, result["corrected"], rtol=0, atol=1e-15)  # in the units of the input
+
+
+def test_units_in_the_header_come_back(
+    cell: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Degrees and millimetres that the file names, with its decimal points, are those of the output."""
+    robot, path = Robot.load(cell["--robot"]), tmp_path / "units.csv"
+    scale = np.where(robot.joint_is_revolute, 180 / np.pi, 1e3)
+    rows = [",".join(map(repr, row)) for row in (np.array(Q) * scale).tolist()]
+    path.write_text("\n".join(["turn [deg],slide [mm],spin [deg],nod [deg]", *rows]))
+    assert main(words(cell | {"--targets": str(path)}, "--units", "mm")) == 0
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header == "turn [deg],slide [mm],spin [deg],nod [deg],expected_error [mm],reached"
+    corrected = np.array([[float(v) for v in line.split(",")[:4]] for line in lines])
+    np.testing.assert_allclose(corrected / scale, np.array(Q) - list(OFFSETS.values()), rtol=0, atol=1e-9)
 
 
 def test_rows_that_cannot_be_reached_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -183,7 +200,7 @@ def test_the_true_robot_is_the_judge(tmp_path: Path, capsys: pytest.CaptureFixtu
     model = typical().with_values({"gravity": 1e-3, "smooth.size": 3e-4})
     truth = SimulatedCell(nominal, random_deviations(nominal, 1), 1e-5, error_model=model, seed=2)
     data, saved, targets = (str(tmp_path / n) for n in ("p.csv", "e.yaml", "q.csv"))
-    write_measurements(data, truth.measure(random_configurations(nominal, 80, 3), 1, 4))
+    write_measurements(data, truth.measure(random_configurations(nominal, 50, 3), 1, 4))
     assert main(["identify", "--robot", "kuka_kr270", "--data", data, "--output", saved]) == 0
     q = random_configurations(nominal, 60, 5) / 2.0
     write_configurations(targets, nominal.joint_names, q)

@@ -16,6 +16,7 @@ from robots import MIXED_URDF, random_configurations
 from calib_planner import FileFormatError, Robot
 from calib_planner.cli import main
 from calib_planner.io import (
+    Reading,
     SavedEstimate,
     measurements_text,
     read_configurations,
@@ -27,6 +28,7 @@ from calib_planner.io import (
 from calib_planner.io.problem import packed
 from calib_planner.io.yaml import write_document
 from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.units import Units
 
 
 def run(words: str, capsys: pytest.CaptureFixture[str]) -> Any:
@@ -134,7 +136,10 @@ def test_targets_are_corrected_as_compensate_does(
     assert Path(one).read_text() == Path(other).read_text()
     assert found["compensation"]["corrected"] == again["corrected"]
     np.testing.assert_allclose(
-        read_configurations(one, robot, degrees=True), again["corrected"], rtol=0, atol=1e-14
+        read_configurations(one, robot, Reading(otherwise=Units(angle="deg"))),
+        again["corrected"],
+        rtol=0,
+        atol=1e-14,
     )
 
 
