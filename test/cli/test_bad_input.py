@@ -57,7 +57,7 @@ CASES = {
     "unknown unit": (f"{PLAN} 2 --test-pose 0,0 --sigma 3ft", 2, ["--sigma", "m, cm, mm, um", "'3ft'"]),
     "decimal comma": (f"{PLAN} 2 --test-pose 0,0 --sigma 0,3mm", 2, ["--sigma", "use a decimal point"]),
     "two sizes": (f"{PLAN} 2 --accuracy 1mm", 2, ["--accuracy", "one of the two", "--configurations"]),
-    "unknown flag": (f"{PLAN} 2 --test-pose 0,0 --speed 3", 2, ["--speed"]),
+    "unknown flag": (f"{PLAN} 2 --test-pose 0,0 --colour 3", 2, ["--colour"]),
     "abbreviated flag": (f"{PLAN} 2 --test-po 0,0", 2, ["--test-po"]),
     "no robot": ("plan --configurations 2", 2, ["--robot"]),
     "no test pose": (f"{PLAN} 2", 2, ["--test-pose", "q1, q2", "--test-path"]),
