@@ -300,7 +300,7 @@ def _values(args: argparse.Namespace, trial: Trial | None) -> dict[str, Any]:
             values[key] = [str(one) for one in value]
             continue
         if key == "mounting" and value not in ("floor", "ceiling"):
-            value = numbers(value)
+            value = numbers(str(value))
         values[key] = value
     stated = [u for u, given in (("mm", args.millimetres), ("deg", args.degrees)) if given]
     units = stated if trial is None else list(trial.units)

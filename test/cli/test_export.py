@@ -123,6 +123,11 @@ def test_the_estimate_comes_back_whole(saved: SavedEstimate) -> None:
     assert np.isfinite(estimate.residuals.spare)
 
 
+def test_coupled_joints_come_back(saved: SavedEstimate) -> None:
+    robot = replace(saved, couple=("nod+=spin",)).nominal_robot()
+    assert [str(one) for one in robot.couplings] == ["nod+=spin"] and not saved.nominal_robot().couplings
+
+
 def test_targets_are_corrected_as_compensate_does(
     made: Path, saved: SavedEstimate, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
