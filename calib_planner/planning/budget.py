@@ -37,7 +37,7 @@ from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning.criteria import POSE_CRITERIA, Criterion, reported_value, ridged
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space, smallest_size, spread_spaces
-from calib_planner.planning.planner import GOOD_ENOUGH, judged, plan, psi_of, value_of
+from calib_planner.planning.planner import GOOD_ENOUGH, Callback, judged, plan, psi_of, value_of
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import Plan
 from calib_planner.planning.tour import Pace, Timetable, visit_times, visiting_order
@@ -194,6 +194,7 @@ def plan_for_time(
     seconds: float,
     start: FloatArray | None = None,
     watch: Watch = lambda done, total: None,
+    callback: Callback | None = None,
 ) -> Split:
     """The best plan that ``seconds`` are enough for: configurations, visits to each, and their order.
 
@@ -203,6 +204,7 @@ def plan_for_time(
         seconds: From the first move to the end of the last measurement [s].
         start: (joints,) where the robot stands before [rad | m]; ``None`` if that is not known.
         watch: Told how many plans are done.
+        callback: As for ``plan``, told of each plan; if it cancels, the best so far is returned.
 
     Raises:
         InfeasibleError: Not even the smallest plan that identifies the parameters fits; says how long it takes.
@@ -211,11 +213,14 @@ def plan_for_time(
     seconds = check_number("time_budget", seconds, low=0, low_open=True, unit="s")
     _check_single(problem)
     smallest = smallest_size(problem)
-    shortest = np.inf
+    shortest, cancelled = np.inf, False
 
     def attempt(m: int) -> _Attempt | None:
-        nonlocal shortest
-        made = plan(replace(problem, configurations=m, repetitions=1))
+        nonlocal shortest, cancelled
+        if cancelled:
+            return None
+        made = plan(replace(problem, configurations=m, repetitions=1), callback)
+        cancelled = made.quality.status == "cancelled"
         tour = _Tour.of(problem, made, pace, start)
         shortest = min(shortest, tour.seconds(tour.once))
         if tour.seconds(tour.once) > seconds:

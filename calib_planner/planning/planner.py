@@ -149,8 +149,17 @@ def judged(
         design, proof = _proven(space, target, design, rng, clock, False)
     work = (0, 0) if searched is None else (searched.quality.starts, searched.quality.evaluations)
     made = _assemble(space, target, design, proof, None, SearchResult(configurations, np.nan, *work), clock, True)
-    before = 0.0 if searched is None else searched.quality.seconds
-    return replace(made, quality=replace(made.quality, seconds=made.quality.seconds + before))
+    return made if searched is None else _as_searched(made, searched.quality)
+
+
+def _as_searched(made: Plan, search: PlanQuality) -> Plan:
+    """The plan with the time of the search that it comes from, and with how that ended if it did not end well."""
+    quality, status = made.quality, made.quality.status
+    if status == "ok" and search.status in ("time_limit", "cancelled"):
+        status = search.status
+    message = quality.message.replace(STATUS[quality.status], STATUS[status])
+    seconds = quality.seconds + search.seconds
+    return replace(made, quality=replace(quality, status=status, message=message, seconds=seconds))
 
 
 def space_of(problem: PlanProblem, configurations: FloatArray, repetitions: ArrayLike) -> PlanSpace:

@@ -20,13 +20,15 @@ from calib_planner.planning import (
     Callback,
     Candidates,
     Constraint,
+    Pace,
     Plan,
     PlanProblem,
     Search,
     plan,
+    plan_for_time,
 )
 from calib_planner.robot import Robot
-from calib_planner.ros.messages import check_rows
+from calib_planner.ros.messages import check_rows, pace_of
 from calib_planner.ros.model import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
@@ -67,7 +69,7 @@ def answer(
     """Make the plan of a request; every fault of the request becomes an ``Answer``."""
     try:
         model = _model(request, settings, own)
-        made = plan(problem_of(request, settings, model), callback)
+        made = _planned(problem_of(request, settings, model), request, settings, model, callback)
     except NotReady as error:
         return Answer("NOT_READY", "robot", cut(error))
     except InputError as error:
@@ -79,6 +81,21 @@ def answer(
         return Answer("INFEASIBLE", "configurations", made.quality.message)
     status = "CANCELLED" if made.quality.status == "cancelled" else "SUCCESS"
     return Answer(status, "", made.quality.message, made, model)
+
+
+def _planned(
+    problem: PlanProblem, request: Any, settings: PlannerParameters, model: Model, callback: Callback | None
+) -> Plan:
+    """The plan of as many configurations as are asked for, or for the time that the node's parameters give."""
+    if settings.time_budget == 0 or int(request.configurations):
+        return plan(problem, callback)
+    return plan_for_time(problem, plan_pace(settings, model), settings.time_budget, callback=callback).plan
+
+
+def plan_pace(settings: PlannerParameters, model: Model) -> Pace:
+    """How fast the robot moves and is measured, by the node's parameters and the robot description."""
+    speeds = (settings.joint_speed, settings.slide_speed, model.speeds)
+    return pace_of(model.robot, *speeds, settings.dwell, settings.settle)
 
 
 def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanProblem:

@@ -91,6 +91,14 @@ class PlannerParameters(PlanParameters):
     constraints: str = at_configure("", CONSTRAINTS)
     joint_speed: float = parameter(0.5, "largest speed of turning joints on ~/trajectory", "rad/s", 1e-3, 100.0)
     slide_speed: float = parameter(0.1, "largest speed of sliding joints on ~/trajectory", "m/s", 1e-4, 100.0)
+    time_budget: float = parameter(
+        0.0,
+        "time for all measurements of a plan, if the request names no number of configurations: the planner "
+        "chooses it, and how often each is measured; 0: the parameter configurations decides",
+        "s",
+        0.0,
+        864000.0,
+    )
     settle: float = parameter(2.0, "time at rest on ~/trajectory before each measurement", "s", 0.0, 3600.0)
     dwell: float = parameter(3.0, "time of each measurement on ~/trajectory, at rest", "s", 0.0, 3600.0)
 

@@ -15,9 +15,10 @@ from robots import random_configurations
 
 from calib_planner import PlanProblem, Robot, plan
 from calib_planner.errors import InputError
-from calib_planner.planning import Search
+from calib_planner.planning import Search, timetable
+from calib_planner.ros.messages import trajectory_message
 from calib_planner.ros.model import NotReady, described_model, shipped_model
-from calib_planner.ros.planning import answer
+from calib_planner.ros.planning import answer, plan_pace
 from calib_planner.ros.settings import PlannerParameters
 
 SETTINGS = PlannerParameters(robot="planar_2r", starts=4, configurations=4, most_configurations=50)
@@ -103,6 +104,23 @@ def test_cancelling_returns_the_best_so_far() -> None:
     found = answer(goal, SETTINGS, OWN, lambda state: state.starts_done > 0)
     assert found.status == "CANCELLED" and found.plan is not None
     assert hasattr(PlanAction.Result, found.status)
+
+
+def test_a_plan_for_a_time_keeps_it_unless_the_request_says_how_many() -> None:
+    settings = replace(SETTINGS, time_budget=200.0, joint_speed=0.2)
+    request = PlanCalibration.Request(test_poses=POSE)
+    own = answer(request, settings, OWN)
+    assert own.plan is not None and own.plan.measurements > len(own.plan.configurations)
+    pace = plan_pace(settings, OWN)
+    assert 180.0 < timetable(own.plan, OWN.robot, pace).seconds <= 200.0
+    points = trajectory_message(own.plan, OWN.robot, pace, 0, "base").points
+    assert points[-1].time_from_start.sec <= 200
+    counted = answer(PlanCalibration.Request(test_poses=POSE, configurations=3), settings, OWN).plan
+    assert counted is not None and counted.measurements == 3
+    told = answer(request, replace(settings, time_budget=5.0), OWN)
+    assert told.status == "INFEASIBLE" and "too short" in told.message
+    stopped = answer(request, settings, OWN, lambda state: state.starts_done > 0)
+    assert stopped.status == "CANCELLED" and stopped.plan is not None
 
 
 def test_it_is_the_library_s_plan() -> None:

@@ -28,10 +28,10 @@ from calib_planner.errors import CalibPlannerError
 from calib_planner.planning import Progress
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.markers import plan_markers
-from calib_planner.ros.messages import pace_of, plan_to_message, trajectory_message
+from calib_planner.ros.messages import plan_to_message, trajectory_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.parameters import LATCHED
-from calib_planner.ros.planning import Answer, answer, constraints_of
+from calib_planner.ros.planning import Answer, answer, constraints_of, plan_pace
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PlannerParameters
 
@@ -165,8 +165,7 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         assert result.plan is not None and result.model is not None
         made, robot, settings = result.plan, result.model.robot, self.settings.value
         _, trajectories, pictures = self._publishers_of
-        speeds = (settings.joint_speed, settings.slide_speed, result.model.speeds)
-        pace = pace_of(robot, *speeds, settings.dwell, settings.settle)
+        pace = plan_pace(settings, result.model)
         try:
             trajectories.publish(trajectory_message(made, robot, pace, stamp, settings.frame_id))
         except CalibPlannerError as error:
