@@ -19,6 +19,7 @@ BEGIN = 1_700_000_000 * NANO
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 T: Any = TYPES.types
 JOINTS, POINT = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PointStamped"
+POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +61,17 @@ def campaign(
 
 
 def message(said: Said) -> Any:
-    """The ROS message; ``extra`` may set ``frame_id``."""
+    """The ROS message; ``extra`` may set ``frame_id``, and the ``kind`` of a point."""
     time = T["builtin_interfaces/msg/Time"](sec=said.stamp // NANO, nanosec=said.stamp % NANO)
     header = T["std_msgs/msg/Header"](stamp=time, frame_id=said.extra.get("frame_id", "tracker"))
+    kind = said.extra.get("kind", POINT)
+    xyz, turned = [float(v) for v in said.values[:3]], T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.6, 0.8)
+    if said.stream and kind == POSE:
+        pose = T["geometry_msgs/msg/Pose"](T["geometry_msgs/msg/Point"](*xyz), turned)
+        return T[POSE](header, pose)
+    if said.stream and kind == TRANSFORM:
+        transform = T["geometry_msgs/msg/Transform"](T["geometry_msgs/msg/Vector3"](*xyz), turned)
+        return T[TRANSFORM](header, "reflector", transform)
     if said.stream:
         return T[POINT](header=header, point=T["geometry_msgs/msg/Point"](*map(float, said.values)))
     none, position = np.empty(0), np.asarray(said.values, float)
@@ -85,7 +94,8 @@ def write_bag(
         to = [writer.add_connection(t, k, typestore=TYPES) for t, k in zip(topics, kinds, strict=True)]
         other = writer.add_connection("/rosout_text", "std_msgs/msg/String", typestore=TYPES)
         for one in said:
-            data = TYPES.serialize_cdr(message(one), POINT if one.stream else JOINTS)
+            kind = one.extra.get("kind", POINT) if one.stream else JOINTS
+            data = TYPES.serialize_cdr(message(one), kind)
             writer.write(to[one.stream], one.arrival, data)
             if one.arrival % 7 == 0:
                 text = TYPES.serialize_cdr(T["std_msgs/msg/String"]("noise"), "std_msgs/msg/String")
