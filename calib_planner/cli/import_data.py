@@ -46,7 +46,8 @@ def add(commands: Commands, summary: str) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     """Do the work."""
     check_files(args)
-    sources = read_sources(args.data, load_robot(args), source_reading(args, terminal), noise_given=False)
+    reading = source_reading(args, terminal)
+    sources = read_sources(args.data, load_robot(args), reading, noise_given=False, placed=False)
     if args.output:
         write_text(args.output, measurements_text(sources.data), "--output")
     elif not args.json:

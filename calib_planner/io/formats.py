@@ -53,8 +53,11 @@ def raw_lines(path: str | Path, what: str) -> RawLines:
     """
     data = read_bytes(path, what)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
+    if start.startswith(b"<?xml") and b"<robot" in data[:4096]:
+        start = b"<robot"
     for magic, kind, advice in REFUSED:
-        if data.startswith(magic) or (magic[:1] in b"<{" and start.lower().startswith(magic.lower())):
+        marked = magic[:1] in b"<{"  # text, in which blanks and capitals do not count
+        if start.lower().startswith(magic.lower()) if marked else data.startswith(magic):
             raise FileFormatError(path, "file", kind, f"{what}: {TABLE}", advice)
     if data.startswith(b"PK\x03\x04"):
         return _archive(path, data, what)

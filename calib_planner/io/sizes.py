@@ -19,7 +19,6 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.robot import Robot
-from calib_planner.units import length
 
 TURN = 2.0 * np.pi
 MOST_RADIANS = 2.0 * TURN
@@ -70,7 +69,7 @@ def lengths_by_size(robot: Robot, points: FloatArray) -> tuple[str, list[str]]:
     spread = max((float(np.ptp(p, axis=0).max()) for p in each if len(p)), default=0.0)
     widest = 2.0 * (reach(robot) + TOOL)
     if CENTIMETRES * widest < spread <= MILLIMETRES * widest:
-        return "mm", [f"the points spread over {spread:.4g}, the robot over {length(widest)} at most"]
+        return "mm", [f"points spread over {spread:.4g}, which in metres they cannot: {widest:.3g} m at most"]
     return "m", []
 
 

@@ -31,16 +31,19 @@ class Sources:
         raise IndexError(row)
 
 
-def read_sources(paths: Sequence[str], robot: Robot, reading: Reading, *, noise_given: bool) -> Sources:
+def read_sources(
+    paths: Sequence[str], robot: Robot, reading: Reading, *, noise_given: bool, placed: bool = True
+) -> Sources:
     """Read files that hold points of as many targets each.
 
     Args:
         noise_given: The noise is stated elsewhere; the files' own standard deviations are left out.
+        placed: As for ``read_source``.
 
     Raises:
         FileFormatError: A file cannot be read, or does not fit the others.
     """
-    files = tuple(read_source(path, robot, reading) for path in paths)
+    files = tuple(read_source(path, robot, reading, placed=placed) for path in paths)
     first = files[0]
     count = first.data.p.shape[1]
     for other in files[1:]:
@@ -55,15 +58,20 @@ def read_sources(paths: Sequence[str], robot: Robot, reading: Reading, *, noise_
     return Sources(_together(files, noise_given), files)
 
 
-def read_source(path: str, robot: Robot, reading: Reading) -> Source:
+def read_source(path: str, robot: Robot, reading: Reading, *, placed: bool = True) -> Source:
     """Read a file of measurements, and test whether its units make sense of the robot.
+
+    Args:
+        placed: The robot says where base and targets are; else they are wherever the points put them.
 
     Raises:
         FileFormatError: As ``read_data``, or the file is in other units.
     """
     source = read_data(path, robot, reading)
     count = source.data.p.shape[1]
-    alike = robot if len(robot.targets) == count else robot.with_targets(np.zeros((count, 3)))
+    alike = robot if placed and len(robot.targets) == count else robot.with_targets(np.zeros((count, 3)))
+    if not placed:
+        alike = alike.with_parameters(robot.parameter_names, ["base", "tool"])
     try:
         check_units(alike, source.data)
     except InputError as error:

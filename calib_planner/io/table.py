@@ -33,7 +33,7 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io.formats import raw_lines
 from calib_planner.io.text import RawLines
-from calib_planner.units import SPELLINGS, brief, listed
+from calib_planner.units import SPELLINGS, brief, counted, listed
 
 MAX_ROWS = 1_000_000
 MAX_COLUMNS = 10_000
@@ -402,7 +402,7 @@ class _Sniffer:
         if len(self.stated) != len(cells):
             wanted = f"{len(cells)} names, for cells like {listed(cells, 12, width=20)}"
             advice = "write '-' for a column that plays no part"
-            raise FileFormatError(self.path, "--columns", f"{len(self.stated)} names", wanted, advice)
+            raise FileFormatError(self.path, "--columns", counted(len(self.stated), "name"), wanted, advice)
 
     # ── rows ─────────────────────────────────────────────────────────────────────────────────────────────
 

@@ -132,6 +132,11 @@ REFUSED: dict[str, tuple[str | bytes, dict, list[str]]] = {
     "gzip": (b"\x1f\x8b\x08", {}, ["a gzip archive", "unpack it"]),
     "ROS 1": (b"#ROSBAG V2.0\n", {}, ["a ROS 1 bag", "rosbags-convert"]),
     "URDF": ("<robot name='x'/>", {}, ["a robot description (URDF)", "--robot"]),
+    "URDF with its first line": (
+        '<?xml version="1.0"?>\n<robot name="x"/>',
+        {},
+        ["a robot description", "--robot"],
+    ),
     "XML": ('<?xml version="1.0"?><Workbook/>', {}, ["XML", "as CSV"]),
     "JSON of nothing": ('{"a": {}, "b": "c"}', {}, ["arrays of numbers"]),
     "JSON of unequal records": ('[{"q": [1, 2]}, {"q": [1]}]', {}, ["'q' of different lengths", "null"]),
@@ -163,7 +168,7 @@ REFUSED: dict[str, tuple[str | bytes, dict, list[str]]] = {
         {"units": Units("m")},
         ["units", "mm, as the file says", "--units m"],
     ),
-    "too few names": (ROW, {"columns": ("j1", "j2")}, ["--columns", "9 names", "2 names", "'-'"]),
+    "too few names": (ROW, {"columns": ("j1", "j2")}, ["--columns", "9 names", "got 2 names", "'-'"]),
     "a line between header and rows": (
         HEAD + "see next page\n" + ROW,
         {},
@@ -220,7 +225,7 @@ def test_lengths_that_sizes_do_not_tell_are_told_by_the_fit(tmp_path: Path, unit
     path = write(tmp_path, DATA, Layout(length=unit))
     assert read_data(path, ROBOT).understanding.units.length == "m"
     with pytest.raises(FileFormatError, match=f"add --units {unit}"):
-        read_source(path, ROBOT.with_parameters("offsets", ["base"]), Reading())
+        read_source(path, ROBOT, Reading(), placed=False)
 
 
 def test_what_sizes_tell_is_told_in_either_unit_only() -> None:
