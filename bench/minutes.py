@@ -1,14 +1,16 @@
 """How many random visits, and how many minutes, are as good as 15 planned ones?
 
-    python bench/minutes.py [--data ../shared/data] [--seeds 6] [--robots NAME …] [--json FILE]
+    python bench/minutes.py [--data ../shared/data] [--seeds 6] [--robots NAME …] [--share 0.3] [--json FILE]
 
 For simulated robots and for a measured UR10: all placement errors, tracker and reflector are unknown; the default
 estimator identifies from the visits, and the mean error at configurations that took no part judges them. They are
-spread over all joint limits, as are the test poses of the plan. A simulated robot errs as the typical error model
-says, each seed another one; the plan knows nothing of the seed. Random visits are the first n of one random
-sequence per seed. For every n the median over the seeds of the quotient random/planned is taken; the number of
-random visits that are as good as the planned ones is where that median is 1, by linear interpolation of its
-logarithm between the two n around the last crossing. ``>`` says that even the largest n is not enough.
+spread over all joint limits, as are the test poses of the plan; with ``--share`` both are where the robot works:
+in a box of that share of every joint's range, whose middle is drawn. Random visits are spread over all joint
+limits and, with ``--share``, over the box as well: the better of the two counts. A simulated robot errs as the
+typical error model says, each seed another one; the plan knows nothing of the seed. Random visits are the first n
+of one random sequence per seed. For every n the median over the seeds of the quotient random/planned is taken; the
+number of random visits that are as good as the planned ones is where that median is 1, by linear interpolation of
+its logarithm between the two n around the last crossing. ``>`` says that even the largest n is not enough.
 
 Both tours are visited in little time (``visiting_order``) at the usual pace: a quarter of the speed limits in the
 URDF, or 0.5 rad/s where there are none; 2 s to settle and 3 s to measure. The minutes of the random visits are
@@ -65,27 +67,30 @@ class Trial:
     Attributes:
         robot: What the timetable is of.
         planned: (15, joints).
-        random: (65, joints) one random sequence.
+        random: Random sequences, (65, joints) each.
         judge: See ``Judge``.
     """
 
     robot: Robot
     planned: FloatArray
-    random: FloatArray
+    random: tuple[FloatArray, ...]
     judge: Judge
 
 
-def simulated(source: str | Path, seeds: int) -> Iterator[Trial]:
-    """Robots that err as the typical model says; one plan for all of them."""
+def simulated(source: str | Path, seeds: int, share: float) -> Iterator[Trial]:
+    """Robots that err as the typical model says; one plan for all; they work in ``share`` of the range."""
     nominal = Robot.load(source).with_targets(REFLECTOR)
     chain, asked = nominal.with_parameters("full"), nominal.with_parameters("full", ("base", "tool"))
     error_model = typical(Isotropic(SIGMA), gravity=gravity_of(asked))
-    low, high = nominal.joint_limits.T
+    everywhere, draw = nominal.joint_limits, np.random.default_rng(0)
+    half = 0.5 * share * np.diff(everywhere)
+    middle = draw.uniform(everywhere[:, :1] + half, everywhere[:, 1:] - half)
+    work = np.hstack([middle - half, middle + half])
 
-    def spread(rng: np.random.Generator, count: int) -> FloatArray:
-        return np.asarray(rng.uniform(low, high, (count, len(low))))
+    def spread(rng: np.random.Generator, count: int, box: FloatArray = work) -> FloatArray:
+        return np.asarray(rng.uniform(*box.T, (count, len(box))))
 
-    tests = spread(np.random.default_rng(0), TESTS)
+    tests = spread(draw, TESTS)
     wide: ErrorModel = with_wide_placement(error_model)
     planned = plan(PlanProblem(asked, tests, PLANNED, noise=SIGMA, error_model=wide)).configurations
     for seed in range(seeds):
@@ -99,7 +104,8 @@ def simulated(source: str | Path, seeds: int) -> Iterator[Trial]:
             found = identify(IdentificationProblem(asked, data)).knowledge.poses(held_out).points  # noqa: B023
             return float(1e3 * np.linalg.norm(found - true, axis=2).mean())
 
-        yield Trial(nominal, planned, spread(rng, max(SIZES)), judge)
+        boxes = (everywhere, work) if share < 1 else (everywhere,)
+        yield Trial(nominal, planned, tuple(spread(rng, max(SIZES), box) for box in boxes), judge)
 
 
 def measured(data: Path, seeds: int) -> Iterator[Trial]:
@@ -119,7 +125,7 @@ def measured(data: Path, seeds: int) -> Iterator[Trial]:
         usual = usual_error_model(robot, SIGMA)
         problem = PlanProblem(robot, pool, PLANNED, noise=SIGMA, error_model=usual, candidates=Candidates(pool))
         order = np.random.default_rng([seed, 3]).permutation(len(pool))
-        yield Trial(robot, plan(problem).configurations, pool[order[: max(SIZES)]], judge)
+        yield Trial(robot, plan(problem).configurations, (pool[order[: max(SIZES)]],), judge)
 
 
 def minutes(robot: Robot, q: FloatArray) -> float:
@@ -130,16 +136,21 @@ def minutes(robot: Robot, q: FloatArray) -> float:
 
 def compare(name: str, trials: Iterator[Trial]) -> dict[str, Any]:
     """One robot: errors and minutes of both, and where they are equal."""
-    planned, times, ratios, random_times = [], [], [], []
+    planned, times = [], []
+    ratios: dict[int, list[list[float]]] = {}
+    random_times: dict[int, list[list[float]]] = {}
     for trial in trials:
         own = trial.judge(trial.planned)
         planned.append(own)
         times.append(minutes(trial.robot, trial.planned))
-        ratios.append([trial.judge(trial.random[:n]) / own for n in SIZES])
-        random_times.append([minutes(trial.robot, trial.random[:n]) for n in SIZES])
-        print(f"{name}: {own:.3f} mm, quotients {np.round(ratios[-1], 2)}", file=sys.stderr)
-    quotient, spent = np.median(ratios, axis=0), np.median(random_times, axis=0)
-    visits, needed = crossing(np.log(quotient), spent)
+        for kind, q in enumerate(trial.random):
+            ratios.setdefault(kind, []).append([trial.judge(q[:n]) / own for n in SIZES])
+            random_times.setdefault(kind, []).append([minutes(trial.robot, q[:n]) for n in SIZES])
+            print(f"{name}: {own:.3f} mm, quotients {np.round(ratios[kind][-1], 2)}", file=sys.stderr, flush=True)
+    quotients = [np.median(each, axis=0) for each in ratios.values()]
+    spent = [np.median(each, axis=0) for each in random_times.values()]
+    every = [crossing(np.log(q), t) for q, t in zip(quotients, spent, strict=True)]
+    visits, needed = min(every)
     return {
         "robot": name,
         "seeds": len(planned),
@@ -149,9 +160,11 @@ def compare(name: str, trials: Iterator[Trial]) -> dict[str, Any]:
         "random_visits": visits,
         "random_minutes": needed,
         "sizes": list(SIZES),
-        "quotients": quotient.tolist(),
-        "quotients_of_seeds": ratios,
-        "minutes_of_sizes": spent.tolist(),
+        "kinds": [
+            {"random_visits": v, "random_minutes": m, "quotients": q.tolist(), "minutes_of_sizes": t.tolist()}
+            for (v, m), q, t in zip(every, quotients, spent, strict=True)
+        ],
+        "quotients_of_seeds": list(ratios.values()),
     }
 
 
@@ -186,6 +199,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--robots", nargs="+", default=["kuka_kr270", "ur10e", "irb120", "measured_ur10"])
+    parser.add_argument("--share", type=float, default=1.0)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     results = []
@@ -196,7 +210,7 @@ def main() -> None:
         elif name == "measured_ur10":
             results.append(compare(name, measured(args.data, args.seeds)))
         else:
-            results.append(compare(name, simulated(urdf if name == "irb120" else name, args.seeds)))
+            results.append(compare(name, simulated(urdf if name == "irb120" else name, args.seeds, args.share)))
     print(table(results))
     if args.json:
         args.json.write_text(json.dumps({"minutes": results}, indent=1) + "\n", encoding="utf-8")
