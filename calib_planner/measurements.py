@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_planner.arrays import FloatArray, IntArray, check_array, check_configurations
 from calib_planner.errors import InputError
+from calib_planner.units import Told, counted, listed
 
 SAME_JOINT = 2e-4
 """Joint values closer than this belong to visits of one configuration [rad | m]."""
@@ -34,8 +35,8 @@ class RejectedPoint:
     residual: float
 
 
-@dataclass(frozen=True, eq=False)
-class Measurements:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurements(Told):
     """N configurations and the points measured there (A1, A2 of the paper).
 
     Attributes:
@@ -51,6 +52,18 @@ class Measurements:
     points: ArrayLike
     std: ArrayLike | None = None
     payload: ArrayLike | None = None
+
+    def _facts(self) -> list[tuple[str, object]]:
+        seen = self.p[self.seen]
+        extent = np.ptp(seen, axis=0).tolist() if len(seen) else [0.0, 0.0, 0.0]
+        said = [word for word, value in (("std", self.std), ("payload", self.payload)) if value is not None]
+        return [
+            ("visits", len(self)),
+            ("points", f"{len(seen)} of {counted(self.p.shape[1], 'target')}"),
+            ("joints", listed(self.joint_names, 8)),
+            ("extent", " × ".join(f"{1e3 * v:.0f}" for v in extent) + " mm"),
+            *([("with", " and ".join(said))] if said else []),
+        ]
 
     def __post_init__(self) -> None:
         put = object.__setattr__

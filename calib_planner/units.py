@@ -11,6 +11,7 @@ import re
 import reprlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
@@ -210,3 +211,19 @@ def brief(value: object, most: int = MOST_CHARACTERS) -> str:
     short.maxlist = short.maxtuple = short.maxdict = 10
     short.maxlevel = 3
     return short.repr(value)[:most]
+
+
+class Told:
+    """A value that says what it is in one line, and in a notebook as a table; a subclass has ``_facts``."""
+
+    def _facts(self) -> Iterable[tuple[str, object]]:
+        """Pairs (what, how much), the most important first."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{what} {value}" for what, value in self._facts())
+        return f"{type(self).__name__}({cut(facts, 300)})"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><th>{escape(w)}</th><td>{escape(cut(v))}</td></tr>" for w, v in self._facts())
+        return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from calib_planner.identification.estimation import ModelEstimate, PlacementAlon
 from calib_planner.identification.term_gain import TermGain
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot
+from calib_planner.units import Told, length
 
 STATUS = {
     "ok": "All requested parameters were identified.",
@@ -415,8 +417,8 @@ UNJUDGED = Verdict("FAIL", ())
 """Nobody has judged the estimate yet."""
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate(Told):
     """Identified parameters with their uncertainty, and what is known of the fit.
 
     Attributes:
@@ -457,6 +459,26 @@ class Estimate:
     verdict: Verdict = UNJUDGED
     model_fit: ModelEstimate | None = field(default=None, repr=False)
     placement_fit: PlacementAlone | None = field(default=None, repr=False)
+
+    def _facts(self) -> list[tuple[str, object]]:
+        fit, points, left = self.fit, self.points, self.left_out
+        tested = self.validation
+        return [
+            ("verdict", self.verdict.level),
+            ("robot", self.calibrated.name),
+            ("parameters", f"{self.observability.rank} of {len(fit.parameters)} identified"),
+            ("points", f"{points.used} of {points.measured} used"),
+            ("before", f"{length(self.residuals.before.rms)} rms"),
+            ("after", f"{length(self.residuals.after.rms)} rms"),
+            *([("left out", f"{length(left.rms)} rms")] if left.count else []),
+            *([("held out", f"{length(tested.rms)} rms")] if tested is not None else []),
+            *([("at test poses", length(self.accuracy.overall))] if len(self.accuracy.test_poses) else []),
+        ]
+
+    def _repr_html_(self) -> str:
+        """The same with the reasons of the verdict."""
+        reasons = "".join(f"<li>{escape(r.text)} {escape(r.advice)}</li>" for r in self.verdict.foremost)
+        return f"{super()._repr_html_()}<ul>{reasons}</ul>"
 
     @property
     def scale_spread(self) -> dict[str, float]:

@@ -20,12 +20,13 @@ from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameErro
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
+from calib_planner.units import Told
 
 LOSSES = ("auto", "linear", "robust")
 
 
-@dataclass(frozen=True, eq=False)
-class IdentificationProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class IdentificationProblem(Told):
     """Find the active parameters of ``robot``, and all else that its error model has, from ``data``.
 
     Where the base (all six ``base.*``) or the targets (all ``target_*``) are among the active parameters,
@@ -60,6 +61,15 @@ class IdentificationProblem:
     test_poses: ArrayLike | None = None
     required_accuracy: float | None = None
     accuracy_frame: str = "world"
+
+    def _facts(self) -> list[tuple[str, object]]:
+        return [
+            ("robot", self.robot.name),
+            ("visits", len(self.data)),
+            ("points", int(self.data.seen.sum())),
+            ("parameters", len(self.robot.parameter_names)),
+            ("error model", self.model.name),
+        ]
 
     def __post_init__(self) -> None:
         put = object.__setattr__

@@ -63,7 +63,7 @@ from calib_planner.io.problem import problem_mapping, saved_problem, saved_robot
 from calib_planner.io.yaml import Node, read_document, write_document
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import Robot, is_nuisance, parse_coupling
-from calib_planner.units import listed
+from calib_planner.units import Told, listed
 
 T = TypeVar("T")
 BASE = ("x", "y", "z", "yaw", "pitch", "roll", "rx", "ry", "rz")
@@ -299,8 +299,8 @@ class SavedKnowledge:
     targets: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class SavedEstimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class SavedEstimate(Told):
     """What an estimate file says.
 
     Attributes:
@@ -350,6 +350,15 @@ class SavedEstimate:
     document: dict[str, Any]
     couple: tuple[str, ...] = ()
     path: str = ""
+
+    def _facts(self) -> list[tuple[str, object]]:
+        return [
+            *([("verdict", self.verdict.level)] if self.verdict is not None else []),
+            ("robot", self.robot),
+            ("parameters", len(self.parameters)),
+            ("status", self.status),
+            ("file", self.path),
+        ]
 
     def nominal_robot(self) -> Robot:
         """The nominal robot, from the file alone, with its nominal targets.

@@ -17,6 +17,7 @@ from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA
 from calib_planner.planning.feasibility import Constraint
 from calib_planner.robot import Robot
 from calib_planner.tracker import Isotropic, Noise
+from calib_planner.units import Told
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +78,8 @@ class Search:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class PlanProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class PlanProblem(Told):
     """Choose ``configurations`` joint configurations that are best by ``criterion``.
 
     Attributes:
@@ -123,6 +124,20 @@ class PlanProblem:
     search: Search = Search()
     accuracy_frame: str = "world"
     error_model: ErrorModel | None = None
+
+    def _facts(self) -> list[tuple[str, object]]:
+        poses = 0 if self.test_poses is None else len(np.asarray(self.test_poses))
+        size = f"{self.configurations} configurations"
+        size += f" × {self.repetitions}" if self.repetitions > 1 else ""
+        return [
+            ("robot", self.robot.name),
+            ("to measure", size),
+            ("parameters", len(self.robot.parameter_names)),
+            ("test poses", poses),
+            ("criterion", self.criterion),
+            ("error model", self.model.name),
+            ("constraints", len(self.constraints)),
+        ]
 
     def __post_init__(self) -> None:
         put, robot = object.__setattr__, self.robot

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray, frozen, plain
+from calib_planner.units import Told, counted, length
 
 STATUS = {
     "ok": "The plan is complete.",
@@ -101,8 +102,8 @@ class PlanQuality:
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), float)))
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Told):
     """What to measure, with its proof.
 
     Attributes:
@@ -126,6 +127,19 @@ class Plan:
     weights: FloatArray
     sigma: float
     quality: PlanQuality
+
+    def _facts(self) -> list[tuple[str, object]]:
+        quality = self.quality
+        accuracy = [("accuracy", length(quality.predicted_accuracy))] if len(self.test_poses) else []
+        efficiency = f"{100 * quality.efficiency:.1f} % ({quality.bound} bound)"
+        return [
+            ("robot", self.robot),
+            ("measurements", f"{self.measurements} at {counted(len(self.configurations), 'configuration')}"),
+            *accuracy,
+            *([("efficiency", efficiency)] if np.isfinite(quality.efficiency) else []),
+            ("criterion", quality.criterion),
+            ("status", quality.status),
+        ]
 
     def __post_init__(self) -> None:
         for name in ("configurations", "test_poses", "weights"):

@@ -28,6 +28,7 @@ from calib_planner.robot.kinematics import Program, codes_of, compile_program, s
 from calib_planner.robot.linearisation import Layout, Linearisation, Posture
 from calib_planner.robot.masses import LinkMass, fault_of
 from calib_planner.robot.parameters import Parameter, resolve_parameters
+from calib_planner.units import Told, listed
 
 MOST_PROGRAMS = 64
 """Programs that a robot remembers."""
@@ -51,8 +52,8 @@ def register_file_reader(reader: Callable[..., Robot]) -> None:
     _file_reader[0] = reader
 
 
-@dataclass(frozen=True, eq=False)
-class Robot:
+@dataclass(frozen=True, eq=False, repr=False)
+class Robot(Told):
     """A serial robot with one or more targets at its tip.
 
     Attributes:
@@ -88,6 +89,16 @@ class Robot:
     remarks: tuple[str, ...] = ()
     couplings: tuple[Coupling, ...] = ()
     motion_limits: FloatArray | None = None
+
+    def _facts(self) -> list[tuple[str, object]]:
+        shown = [("coupled", listed(map(str, self.couplings)))] if self.couplings else []
+        return [
+            ("name", self.name),
+            ("joints", f"{len(self.joint_names)} ({listed(self.joint_names, 8)})"),
+            *shown,
+            ("targets", len(self.targets)),
+            ("parameters", f"{len(self.parameter_names)} of {len(self.available_parameters)}"),
+        ]
 
     def __post_init__(self) -> None:
         joints = [e.joint for e in self.elements if e.joint is not None]
