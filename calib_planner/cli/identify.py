@@ -216,7 +216,7 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 def add_points(data: Group) -> None:
     """--points, what may be stated about them, and --millimetres."""
-    text = "list of points of --data, which then has the joints only; repeat, one list per reflector"
+    text = "list of points beside a table that has the joints only; repeat, one list per reflector"
     option(data, "--points", "FILE", text, action="append")
     option(data, "--point-columns", '"name x y z"', "as --columns, for --points", kind=column_names)
     text = "how points and joints belong together: name, time or order (the first that is possible)"

@@ -25,7 +25,7 @@ EXAMPLE = """calib-planner import joints.xlsx --points tracker.txt --robot arm.u
 
 DESCRIPTION = """Read measurements as they come and write them as this package's CSV.
 
-The files are those of identify --data: text with any separator, decimal comma or not, with or without header,
+The files are those that identify reads: text with any separator, decimal comma or not, with or without header,
 title lines and units; XLSX, MAT, NPY, NPZ, JSON; bags; and lists of points beside a table of joints. What was
 recognised is said in one line per file. What is written has a column per joint [rad | m], x1,y1,z1,… and
 std_x1,… [m], and payload [kg]; several files are put together."""
