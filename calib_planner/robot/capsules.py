@@ -55,7 +55,7 @@ class Capsules:
         if len(radii) not in (1, count):
             wanted = f"one radius, or {count}: base column, then behind {', '.join(robot.joint_names)}"
             raise InputError("radii", f"{len(radii)} radii", wanted)
-        return np.broadcast_to(radii, (count,))
+        return radii if len(radii) == count else np.full(count, radii[0])
 
 
 def segments(robot: Robot, posture: Posture) -> tuple[FloatArray, FloatArray]:

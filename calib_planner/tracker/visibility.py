@@ -62,11 +62,11 @@ def segment_distances(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
     first, second, gap = b - a, d - c, a - c
     aa, bb, ab = _dot(first, first), _dot(second, second), _dot(first, second)
     ag, bg = _dot(first, gap), _dot(second, gap)
-    free = aa * bb - ab * ab
-    s = np.clip(_divide(ab * bg - ag * bb, free), 0.0, 1.0)
-    t = np.clip(_divide(ab * s + bg, bb), 0.0, 1.0)
-    s = np.clip(_divide(ab * t - ag, aa), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(gap + s[..., None] * first - t[..., None] * second, axis=-1))
+    s = _share(ab * bg - ag * bb, aa * bb - ab * ab)
+    t = _share(ab * s + bg, bb)
+    s = _share(ab * t - ag, aa)
+    between = gap + s[..., None] * first - t[..., None] * second
+    return np.asarray(np.sqrt(_dot(between, between)))
 
 
 def shortened(station: FloatArray, points: FloatArray, near: float) -> FloatArray:
@@ -93,6 +93,8 @@ def _dot(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("...i,...i->...", x, y))
 
 
-def _divide(x: FloatArray, y: FloatArray) -> FloatArray:
-    """x / y, and 0 where y is 0: any s or t will do there."""
-    return np.where(y > 0, x / np.where(y > 0, y, 1.0), 0.0)
+def _share(x: FloatArray, y: FloatArray) -> FloatArray:
+    """x / y within [0, 1], and 0 where y is 0: any s or t will do there."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        share = np.where(y > 0, x / y, 0.0)
+    return np.minimum(np.maximum(share, 0.0), 1.0)

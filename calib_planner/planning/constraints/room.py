@@ -97,8 +97,8 @@ class MinimumHeight(PostureConstraint):
         origins = np.concatenate([posture.joint_origins, posture.tip_origin[:, None]], axis=1)
         heights = origins @ up
         if self.capsules is not None:
-            radii = self.capsules.of(robot)[1:]
-            heights -= np.maximum(np.append(radii, 0.0), np.insert(radii, 0, 0.0))
+            radii = np.concatenate([[0.0], self.capsules.of(robot)[1:], [0.0]])
+            heights -= np.maximum(radii[1:], radii[:-1])
         first = 1 if robot.joint_is_revolute[0] else 0
         return np.concatenate([heights[:, first:], posture.targets @ up], axis=1) - self.height
 

@@ -6,6 +6,7 @@ that share a joint are left out. Everything else may not intersect. Pinocchio is
 
 from __future__ import annotations
 
+import threading
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,7 +38,12 @@ class SelfCollision:
 
     def __getstate__(self) -> dict[str, Any]:
         """The state without Pinocchio's models: a process that receives a copy builds its own."""
-        return {k: v for k, v in self.__dict__.items() if k != "_models"}
+        return {k: v for k, v in self.__dict__.items() if k not in ("_models", "_own")}
+
+    @cached_property
+    def _own(self) -> threading.local:
+        """What each thread works with: Pinocchio's data, made once."""
+        return threading.local()
 
     @cached_property
     def _models(self) -> tuple[Any, Any]:
@@ -75,8 +81,10 @@ class SelfCollision:
         pin = import_pinocchio()
         model, geometry = self._models
         full = self._coordinates(model, robot, q)
-        data, shapes = model.createData(), geometry.createData()
-        _start_afresh(shapes)
+        if not hasattr(self._own, "data"):
+            self._own.data = model.createData(), geometry.createData()
+            _start_afresh(self._own.data[1])
+        data, shapes = self._own.data
         hits = [pin.computeCollisions(model, data, geometry, shapes, row, True) for row in full]
         return ~np.array(hits, dtype=bool)
 
@@ -86,11 +94,12 @@ class SelfCollision:
         for joint in model.joints[1:]:
             if joint.nq == 2:
                 full[:, joint.idx_q] = 1.0
+        names = list(model.names)
         for name, column in zip(robot.joint_names, robot.motions(q).T, strict=True):
-            if not model.existJointName(name):
-                names = ", ".join(list(model.names)[1:])
-                raise InputError(f"joint {name}", f"not in {self.urdf_path}", f"one of its joints: {names}")
-            joint = model.joints[model.getJointId(name)]
+            if name not in names:
+                valid = f"one of its joints: {', '.join(names[1:])}"
+                raise InputError(f"joint {name}", f"not in {self.urdf_path}", valid)
+            joint = model.joints[names.index(name)]
             if joint.nq == 2:
                 full[:, joint.idx_q], full[:, joint.idx_q + 1] = np.cos(column), np.sin(column)
             else:
