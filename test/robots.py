@@ -99,3 +99,34 @@ CASES = {
     "mixed offsets": lambda: mixed().with_parameters("offsets"),
     "mixed full": lambda: mixed().with_parameters("full", ("base", "tool")),
 }
+
+
+def cylinder_urdf(robot: Robot, radii: list[float], share: float = 0.7) -> str:
+    """A URDF of the same joints whose links are cylinders, about the middle ``share`` of the segments of the body
+    that ``calib_planner.robot.Capsules`` has; segments without length have no shape."""
+    posture = robot.posture(np.zeros(len(robot.joint_names)))
+    nodes = np.concatenate([[robot.base_pose[1]], posture.joint_origins[0], posture.tip_origin])
+
+    def link(k: int) -> str:
+        x, y, z = v = nodes[k + 1] - nodes[k]
+        length = float(np.linalg.norm(v))
+        if length < 1e-9:
+            return f'<link name="l{k}"/>'
+        turn = f"0 {np.arctan2(np.hypot(x, y), z)} {np.arctan2(y, x)}"
+        return (
+            f'<link name="l{k}"><collision><origin xyz="{x / 2} {y / 2} {z / 2}" rpy="{turn}"/><geometry>'
+            f'<cylinder radius="{radii[k]}" length="{share * length}"/></geometry></collision></link>'
+        )
+
+    def joint(k: int) -> str:
+        x, y, z = nodes[k + 1] - nodes[k]
+        axis, (low, high) = posture.joint_axes[0, k], robot.joint_limits[k]
+        return (
+            f'<joint name="{robot.joint_names[k]}" type="revolute"><origin xyz="{x} {y} {z}"/>'
+            f'<parent link="l{k}"/><child link="l{k + 1}"/><axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
+            f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/></joint>'
+        )
+
+    count = len(robot.joint_names)
+    parts = [link(k) for k in range(count + 1)] + [joint(k) for k in range(count)]
+    return f'<robot name="{robot.name}">{"".join(parts)}</robot>'

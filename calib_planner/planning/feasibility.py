@@ -32,7 +32,7 @@ DIFFERENCE = 1e-6
 is far below what one step of a search bends away from its tangent."""
 CORRECTIONS = 2
 """Newton's steps back over an edge; the second one takes what bends of the first."""
-RETREATS = (0.3,)
+RETREATS = (0.3, 0.05)
 """Shares of an infeasible step that are tried in its place."""
 
 

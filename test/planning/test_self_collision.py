@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from robots import cylinder_urdf
 
 from calib_planner import FileFormatError, InputError, PlanProblem, Robot, plan
 from calib_planner.planning import Search, SelfCollision
@@ -100,6 +101,24 @@ def test_plans_avoid_collisions(arm):
         PlanProblem(robot.with_parameters("offsets"), [0.3, 0.5], 3, constraints=(free,), search=Search(starts=4))
     )
     assert SelfCollision(free.urdf_path).allowed(robot, found.configurations).all()
+
+
+def test_no_collision_is_missed_after_a_deep_one(tmp_path):
+    """Coal begins where it ended for the last configuration, unless told not to, and then missed the 342nd of these.
+    Distances, which do not remember, are the oracle."""
+    robot = Robot.load("kuka_kr270")
+    path = tmp_path / "cylinders.urdf"
+    path.write_text(cylinder_urdf(robot, [0.30, 0.25, 0.18, 0.15, 0.12, 0.12, 0.10]))
+    q = np.random.default_rng(5).uniform(*robot.joint_limits.T, (400, 6))
+    free = SelfCollision(path)
+    model, shapes = free._models
+    data, distances = model.createData(), shapes.createData()
+    deep = []
+    for row in q:
+        pin.computeDistances(model, data, shapes, distances, row)
+        deep.append(min(r.min_distance for r in distances.distanceResults) < -1e-4)
+    assert 20 < sum(deep) < 100 and deep[341]
+    assert not free.allowed(robot, q)[deep].any()
 
 
 def test_it_travels_to_other_processes(arm):

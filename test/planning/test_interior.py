@@ -1,0 +1,174 @@
+"""Descents inside the allowed set: known minima on edges, normals by hand, and plans as good as a long search's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_planner import PlanProblem, Robot, plan
+from calib_planner.planning import (
+    Feasibility,
+    MinimumHeight,
+    ReflectorAcceptance,
+    Search,
+    TrackerElevation,
+    TrackerRange,
+    WorkspaceBox,
+)
+from calib_planner.planning.constraints import Custom
+from calib_planner.planning.feasibility import PlanWalls
+from calib_planner.planning.search.interior import descend_inside
+
+STATION = np.array([4.0, 1.5, 1.2])
+WIDE = np.full(4, 9.0)
+
+
+class Disc:
+    """Two points of the plane a row, each within the unit disc, and left of ``right`` without a margin."""
+
+    def __init__(self, right=np.inf):
+        self.right = right
+
+    def margins(self, x):
+        return 1.0 - np.sum(x.reshape(len(x), 2, 2) ** 2, axis=2, keepdims=True)
+
+    def normals(self, x):
+        return -2.0 * x.reshape(len(x), 2, 1, 2)
+
+    def step(self, old, new, margins, normals):
+        promised = margins + np.einsum("rckj,rcj->rck", normals, (new - old).reshape(len(new), 2, 2))
+        points = new.reshape(len(new), 2, 2)
+        radius = np.sqrt(np.sum(points**2, axis=2, keepdims=True))
+        points = np.where(radius > 1.0, points / radius * np.sqrt(1.0 - np.clip(promised, 0.0, 0.5)), points)
+        ok = points[..., 0] <= self.right
+        x = np.where(ok[..., None], points, old.reshape(points.shape)).reshape(new.shape)
+        return x, self.margins(x)
+
+
+def squares(centre, weights):
+    """½ Σ w (x − c)²."""
+
+    def objective(x):
+        return 0.5 * np.sum(weights * (x - centre) ** 2, axis=1), weights * (x - centre)
+
+    return objective
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_minima_on_a_circle_and_inside(seed):
+    """Of equal weights the nearest point of the disc: c/|c| outside of it, c within."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, 2)
+    centre = np.concatenate([3.0 * np.array([np.cos(angle[0]), np.sin(angle[0])]), 0.5 * np.cos(angle)])
+    start = rng.uniform(-0.5, 0.5, (6, 4))
+    ended = descend_inside(squares(centre, np.ones(4)), Disc(), start, -WIDE, WIDE, pressures=(1e-2, 1e-7))
+    wanted = np.concatenate([centre[:2] / 3.0, centre[2:]])
+    np.testing.assert_allclose(ended.x, np.tile(wanted, (6, 1)), atol=1e-3)
+    assert (Disc().margins(ended.x) > 0).all()
+
+
+def test_the_edge_is_followed_a_long_way():
+    """Unequal weights: the minimum on the circle, a quarter turn from the start, is where ∇f is radial."""
+    weights, centre = np.array([1.0, 30.0, 1.0, 30.0]), np.array([0.3, 3.0, 3.0, 0.1])
+    start = np.array([[0.99, 0.0, 0.0, -0.99]])
+    ended = descend_inside(squares(centre, weights), Disc(), start, -WIDE, WIDE, pressures=(1e-2, 1e-7))
+    points = ended.x.reshape(2, 2)
+    force = (weights * (centre - ended.x)).reshape(2, 2)
+    assert np.abs(points[:, 0] * force[:, 1] - points[:, 1] * force[:, 0]).max() < 0.05
+    assert (np.sum(points * force, axis=1) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-4)
+
+
+def test_joint_limits_and_a_mere_no_hold_beside_the_margins():
+    objective = squares(np.array([3.0, 0.0, 0.0, 3.0]), np.ones(4))
+    low, high = np.array([-9.0, -9.0, -9.0, -9.0]), np.array([9.0, 9.0, 9.0, 0.5])
+    ended = descend_inside(objective, Disc(right=0.4), np.zeros((1, 4)), low, high)
+    x = ended.x[0]
+    assert x[0] <= 0.4 and x[3] <= 0.5
+    np.testing.assert_allclose(x[2:], [0.0, 0.5], atol=1e-3)
+    assert x[0] > 0.3  # rejected steps are shortened, not given up
+
+
+# ── the walls of a robot ─────────────────────────────────────────────────────────────────────────────────
+
+
+def room():
+    robot = Robot.load("kuka_kr270")
+    constraints = (
+        WorkspaceBox([0.3, -2.0, 0.3], [3.0, np.inf, 2.5]),
+        TrackerRange(STATION, 1.0, 6.0),
+        TrackerElevation(STATION, low=-0.8, high=1.0),
+        ReflectorAcceptance(STATION, [1, 0, 0], np.pi / 6),
+        MinimumHeight(0.2),
+    )
+    return robot, Feasibility(robot, constraints)
+
+
+def test_normals_by_hand():
+    """From ∂p/∂q and the joints' axes; the constraints themselves take differences."""
+    robot, feasible = room()
+    q = feasible.sample(np.random.default_rng(0), 8)
+    normals = PlanWalls(feasible, 2).normals(q.reshape(4, -1)).reshape(8, -1, 6)
+    by_joint = robot.joint_jacobian(q)  # (N, 3, joints)
+    p = robot.positions(q)[:, 0]
+    beam = p - STATION
+    d = np.linalg.norm(beam, axis=1)[:, None]
+    along = np.einsum("ni,nij->nj", beam / d, by_joint)
+    box = np.concatenate([by_joint, -by_joint[:, [0, 2]]], axis=1)
+    level = np.hypot(beam[:, 0], beam[:, 1])[:, None]
+    rise = by_joint[:, 2] / level - beam[:, 2:] / (level * d) * along  # d arcsin(h/d)
+    posture = robot.posture(q)
+    normal = posture.tip_rotation[:, :, 0]
+    turning = np.cross(posture.joint_axes, normal[:, None])  # (N, joints, 3)
+    facing = -np.einsum("nji,ni->nj", turning, beam / d) - np.einsum("ni,nij->nj", normal, by_joint) / d
+    facing += np.sum(normal * beam, axis=1)[:, None] / d**2 * along
+    hand = np.concatenate([box, along[:, None], -along[:, None], rise[:, None], -rise[:, None], facing[:, None]], 1)
+    np.testing.assert_allclose(normals[:, : hand.shape[1]], hand, atol=2e-5)
+
+
+def test_steps_end_inside_and_keep_what_the_tangent_promised():
+    """A step along the tangent leaves the set by the curvature; it comes back nearly whole."""
+    robot, feasible = room()
+    walls = PlanWalls(feasible, 1)
+    q = feasible.sample(np.random.default_rng(1), 300)
+    margins, normals = walls.margins(q), walls.normals(q)
+    nearest = np.argmin(margins[:, 0], axis=1)
+    a = normals[np.arange(300), 0, nearest]
+    rng = np.random.default_rng(2)
+    d = rng.normal(size=q.shape)
+    d -= np.sum(d * a, axis=1)[:, None] / np.sum(a * a, axis=1)[:, None] * a
+    low, high = feasible.limits.T
+    new = np.clip(q + 0.05 * d, low, high)
+    reached, left = walls.step(q, new, margins, normals)
+    assert feasible.mask(reached).all()
+    np.testing.assert_allclose(left, walls.margins(reached), atol=1e-15)
+    outside = ~feasible.mask(new)
+    assert outside.sum() > 10
+    share = np.linalg.norm(reached - q, axis=1) / np.linalg.norm(new - q, axis=1)
+    assert np.median(share[outside]) > 0.8
+
+
+def test_constraints_give_margins_or_only_masks():
+    robot, feasible = room()
+    q = feasible.sample(np.random.default_rng(3), 50)
+    half = Custom("half", lambda q: q[:, 0] < 0)
+    both = Feasibility(robot, (*feasible.constraints, half))
+    assert feasible.masks == () and both.masks == (half,)
+    ok, margins = both.measured(q)
+    np.testing.assert_array_equal(ok, both.mask(q))
+    np.testing.assert_array_equal(margins, feasible.margins(q))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_plans_along_the_edge(seed):
+    """A long search (40 times the starts, five seeds) reaches LONG; rejected steps ended 2 to 4 % above it."""
+    robot, feasible = room()
+    pose = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
+    search = Search(starts=24, seed=seed)
+    found = plan(PlanProblem(robot, pose, 6, constraints=feasible.constraints, search=search))
+    assert feasible.mask(found.configurations).all()
+    assert found.quality.predicted_accuracy < LONG * 1.01
+
+
+LONG = 23.7e-6
+"""ρ0 of that search [m]."""
