@@ -122,7 +122,9 @@ def test_normals_by_hand():
     turning = np.cross(posture.joint_axes, normal[:, None])  # (N, joints, 3)
     facing = -np.einsum("nji,ni->nj", turning, beam / d) - np.einsum("ni,nij->nj", normal, by_joint) / d
     facing += np.sum(normal * beam, axis=1)[:, None] / d**2 * along
-    hand = np.concatenate([box, along[:, None], -along[:, None], rise[:, None], -rise[:, None], facing[:, None]], 1)
+    hand = np.concatenate(
+        [box, along[:, None], -along[:, None], rise[:, None], -rise[:, None], facing[:, None]], 1
+    )
     np.testing.assert_allclose(normals[:, : hand.shape[1]], hand, atol=2e-5)
 
 
@@ -170,5 +172,5 @@ def test_plans_along_the_edge(seed):
     assert found.quality.predicted_accuracy < LONG * 1.01
 
 
-LONG = 23.7e-6
+LONG = 23.79e-6
 """ρ0 of that search [m]."""
