@@ -119,6 +119,19 @@ def length(metres: float) -> str:
     return f"{1e3 * metres:.4g} mm"
 
 
+def lengths(*metres: float) -> tuple[str, ...]:
+    """Lengths that are compared with each other, all in the unit of the largest, each with three digits."""
+    known = [abs(m) for m in metres if np.isfinite(m)]
+    factor, unit = (1e3, "mm") if max(known, default=0.0) >= 1e-3 else (1e6, "µm")
+    return tuple(f"{_three_digits(factor * m)} {unit}" if np.isfinite(m) else length(m) for m in metres)
+
+
+def _three_digits(value: float) -> str:
+    """A number with three significant digits and without an exponent; at most six decimals."""
+    places = 2 - int(np.floor(np.log10(abs(value)))) if value else 0
+    return f"{value:.{min(max(places, 0), 6)}f}"
+
+
 def milli(value: float, digits: int = 4) -> str:
     """A length [m] in mm or an angle [rad] in mrad for a column of a table, with ``digits`` decimals, no unit."""
     return f"{1e3 * value:.{digits}f}" if np.isfinite(value) else "unknown"

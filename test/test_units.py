@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_planner.units import PER_UNIT, quantity
+from calib_planner.units import PER_UNIT, lengths, quantity
 
 
 @pytest.mark.parametrize(
@@ -51,3 +51,11 @@ def test_what_is_no_length(text: str) -> None:
 def test_another_kind_of_unit_is_refused() -> None:
     with pytest.raises(ValueError, match=r"number \[rad\]"):
         quantity("1mm", "rad")
+
+
+def test_lengths_that_are_compared_have_one_unit() -> None:
+    assert lengths(8.303e-3, 6.17e-5) == ("8.30 mm", "0.0617 mm")
+    assert lengths(5.26e-4, 4.66e-4) == ("526 µm", "466 µm")
+    assert lengths(0.123, 1e-3, 4e-9) == ("123 mm", "1.00 mm", "0.000004 mm")
+    assert lengths(2e-5, np.inf) == ("20.0 µm", "unlimited") and lengths(np.inf) == ("unlimited",)
+    assert lengths(0.0, 9.994e-4) == ("0 µm", "999 µm")

@@ -27,7 +27,7 @@ from calib_planner.error_model import ErrorModel, gravity_of, typical
 from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.tracker import Isotropic, Noise
-from calib_planner.units import cut, length
+from calib_planner.units import cut, length, lengths
 
 FEWEST_SPARE = 10
 """Equations beyond the parameters from which an estimate can be judged."""
@@ -153,15 +153,17 @@ def outcome_of(state: CampaignState, known: Assessment | None) -> tuple[str, str
     """A key of ``OUTCOMES`` and why; empty: go on."""
     problem, required = state.problem, f"{length(state.problem.required_accuracy)} required"
     if known is not None and ready(state, known) and known.accuracy <= problem.required_accuracy and sound(known):
-        return "reached", f"{length(known.accuracy)} predicted, {required}"
+        predicted, wanted = lengths(known.accuracy, problem.required_accuracy)
+        return "reached", f"{predicted} predicted, {wanted} required"
     if state.given_up > problem.most_failures:
         reasons = sorted({e.reason for e in state.exclusions if not e.requested})
         return "unreachable", f"{state.given_up} configurations given up: {cut('; '.join(reasons), 300)}"
     if state.spent(FIT) >= problem.fit_budget:
         return "budget_spent", f"{_now(state, known)}, {required}{_forecast_text(state, known)}"
     if known is not None and ready(state, known) and limited(state, known):
-        surely = f"{length(known.floor)} of repeatability at a test pose, surely more than {length(known.surely)}"
-        return "limited", f"{surely}; {required}"
+        floor, least, wanted = lengths(known.floor, known.surely, problem.required_accuracy)
+        surely = f"{floor} of repeatability at a test pose, surely more than {least}"
+        return "limited", f"{surely}; {wanted} required"
     return "", ""
 
 

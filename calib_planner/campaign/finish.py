@@ -38,7 +38,7 @@ from calib_planner.errors import CalibPlannerError, InfeasibleError
 from calib_planner.identification import Estimate, Reason, Rule, Verdict, validate, without_noise
 from calib_planner.measurements import SAME_JOINT, Measurements
 from calib_planner.planning import Feasibility, visiting_order
-from calib_planner.units import counted, length
+from calib_planner.units import counted, lengths
 
 NEAR = 0.1
 """Half width of the neighbourhood of a test pose, as a share of each joint's range."""
@@ -126,10 +126,10 @@ def _held_out(state: CampaignState, count: int) -> FloatArray:
 
 def _reasons(state: CampaignState, known: Assessment) -> list[Reason]:
     """Everything that is said of the estimate, its validation included."""
-    held_out, required = state.data(VALIDATION), length(state.problem.required_accuracy)
-    worst = length(known.accuracy) if np.isfinite(known.accuracy) else "nothing"
+    held_out = state.data(VALIDATION)
+    worst, floor, required = lengths(known.accuracy, known.floor, state.problem.required_accuracy)
+    worst = worst if np.isfinite(known.accuracy) else "nothing"
     level = "PASS" if known.accuracy <= state.problem.required_accuracy else "FAIL"
-    floor = length(known.floor)
     reasons = [RULES["required_accuracy"].reason(level, worst=worst, floor=floor, required=required)]
     estimate = validated(known, held_out)
     at_test_poses = _at_test_poses(state)
@@ -137,7 +137,7 @@ def _reasons(state: CampaignState, known: Assessment) -> list[Reason]:
         reasons.append(_achieved(estimate, state.problem.required_accuracy, at_test_poses))
     told = estimate.validation
     if held_out is not None and told is not None and contradicted(estimate, held_out):
-        achieved, predicted = length(told.rms), length(told.predicted_rms)
+        achieved, predicted = lengths(told.rms, told.predicted_rms)
         reasons.append(RULES["contradicted"].reason(achieved=achieved, predicted=predicted))
     return reasons + list(estimate.verdict.reasons)
 
@@ -250,10 +250,11 @@ def _achieved(estimate: Estimate, required: float, data: Measurements) -> Reason
     residuals = (data.p - estimate.positions(data.q))[data.seen]
     square, noise = float(np.mean(np.sum(residuals**2, axis=1))), 3.0 * estimate.noise.sigma**2
     visits = int(data.seen.any(axis=1).sum())
+    achieved, own, wanted = lengths(float(np.sqrt(square)), float(np.sqrt(noise)), required)
     return RULES["achieved_at_test_poses"].reason(
         "PASS" if without_noise(square, noise, 3.0 * visits) <= required else "FAIL",
         points=counted(len(residuals), "point"),
-        achieved=length(float(np.sqrt(square))),
-        noise=length(float(np.sqrt(noise))),
-        required=length(required),
+        achieved=achieved,
+        noise=own,
+        required=wanted,
     )

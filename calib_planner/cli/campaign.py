@@ -58,7 +58,7 @@ from calib_planner.io import (
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 from calib_planner.simulation import simulate_campaign
-from calib_planner.units import counted, length
+from calib_planner.units import counted, length, lengths
 
 DESCRIPTION = """Plan a batch, measure it, identify, plan the rest from what was measured, until the accuracy is
 reached, the budget is spent, or more measurements cannot help; then validate on configurations that took no part.
@@ -270,16 +270,20 @@ def show_result(result: CampaignResult, achieved: FloatArray | None, console: Co
     estimate = result.estimate
     if estimate is not None and estimate.validation is not None:
         v = estimate.validation
+        achieved_rms, predicted_rms, before = lengths(v.rms, v.predicted_rms, v.before_mean)
+        there = any(r.code == "achieved_at_test_poses" for r in result.verdict.reasons)
+        where = "the test poses among them" if there else "away from the test poses, where nothing is required"
         console.print(
-            f"Validation on {counted(v.count, 'point')}: {length(v.rms)} achieved, {length(v.predicted_rms)} "
-            f"predicted (rms); before calibration {length(v.before_mean)} (mean)."
+            f"Validation on {counted(v.count, 'point')}, {where}: {achieved_rms} achieved, {predicted_rms} "
+            f"predicted for them (rms); before calibration {before} (mean)."
         )
     if achieved is not None:
-        true = ", ".join(length(a) for a in achieved)
-        predicted = "nothing" if estimate is None else length(estimate.accuracy.worst)
+        worst = np.inf if estimate is None else estimate.accuracy.worst
+        *true, predicted, of_a_visit = lengths(*achieved, worst, result.accuracy)
         console.print(
-            f"True error at the test poses: {true} on average over visits; {predicted} predicted, "
-            f"{length(result.accuracy)} with the repeatability of a visit."
+            f"True error at the test poses: {', '.join(true)} on average over visits; "
+            f"{'nothing' if estimate is None else predicted} predicted, "
+            f"{of_a_visit} with the repeatability of a visit."
         )
     console.print(f"{result.spent} of {counted(result.budget, 'measurement')} spent, "
                   f"{counted(len(result.exclusions), 'configuration')} given up.")  # fmt: skip

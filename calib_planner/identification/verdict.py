@@ -35,7 +35,7 @@ from calib_planner.identification.estimate import (
     Verdict,
     chance_of,
 )
-from calib_planner.units import counted, length, listed
+from calib_planner.units import counted, length, lengths, listed
 
 LARGEST_RESIDUAL = 5e-3
 """No industrial robot is left with more than this after a calibration that was set up rightly [m]."""
@@ -246,10 +246,12 @@ def _solution(e: Estimate) -> Iterator[Reason]:
     if after.rms > LARGEST_RESIDUAL:
         yield RULES["large_residuals"].reason(after=length(after.rms))
     elif after.rms > max(LARGE_RESIDUAL, LITTLE * before.rms):
-        yield RULES["explained_little"].reason(before=length(before.rms), after=length(after.rms))
+        was, left = lengths(before.rms, after.rms)
+        yield RULES["explained_little"].reason(before=was, after=left)
     elif after.mean > 0.9 * before.mean:
         level = "PASS" if _is_noise(e, before.rms) else "WARN"
-        yield RULES["no_gain"].reason(level, before=length(before.mean), after=length(after.mean))
+        was, left = lengths(before.mean, after.mean)
+        yield RULES["no_gain"].reason(level, before=was, after=left)
 
 
 def _alternatives(e: Estimate) -> Iterator[Reason]:
@@ -297,9 +299,10 @@ def _scatter(e: Estimate) -> Iterator[Reason]:
 
 def _left_out(e: Estimate) -> Iterator[Reason]:
     left, before, required = e.left_out, e.residuals.before.mean, e.accuracy.required
-    terms = [f"{t.name} {length(t.size)}" for t in e.terms if t.used and t.name in SYSTEMATIC]
+    used = [t for t in e.terms if t.used and t.name in SYSTEMATIC]
+    terms = [f"{t.name} {size}" for t, size in zip(used, lengths(*(t.size for t in used)), strict=True)]
     if terms:
-        alone, complete = length(e.placement_alone.rms), length(left.rms)
+        alone, complete = lengths(e.placement_alone.rms, left.rms)
         level = "WARN" if _needs_all_terms(e) else "PASS"
         yield RULES["error_model"].reason(level, terms=", ".join(terms), alone=alone, complete=complete)
     if not left.count:
@@ -310,9 +313,10 @@ def _left_out(e: Estimate) -> Iterator[Reason]:
         yield RULES["too_few_measurements"].reason(spare=f"{e.residuals.spare:.1f}")
     if left.mean >= before and not e.accuracy.overall < before:
         level = "WARN" if few else "FAIL"
-        yield RULES["no_gain_left_out"].reason(level, after=length(left.mean), before=length(before))
-    predicted = length(left.predicted_rms)
-    yield _graded("left_out", _exceeded(left), achieved=length(left.rms), predicted=predicted)
+        now, was = lengths(left.mean, before)
+        yield RULES["no_gain_left_out"].reason(level, after=now, before=was)
+    achieved, predicted = lengths(left.rms, left.predicted_rms)
+    yield _graded("left_out", _exceeded(left), achieved=achieved, predicted=predicted)
     if np.isfinite(required) and not len(e.accuracy.predicted):
         yield _achieved("required_accuracy: left out", left, required)
 
@@ -334,12 +338,13 @@ def _exceeded(achieved: LeftOutError | Validation) -> float:
 def _achieved(key: str, achieved: LeftOutError | Validation, required: float, **values: object) -> Reason:
     """Whether the robot's own part of what is achieved is what is required."""
     level = "PASS" if achieved.robot_rms <= required else "WARN" if achieved.robot_least <= required else "FAIL"
-    of_it = f"of it {length(achieved.noise_rms)} the measurement's"
+    reached, noise, wanted = lengths(achieved.rms, achieved.noise_rms, required)
+    of_it = f"of it {noise} the measurement's"
     return RULES[key].reason(
         level,
-        achieved=length(achieved.rms),
+        achieved=reached,
         noise=of_it if achieved.noise_rms > 0 else "the measurement's part included",
-        required=length(required),
+        required=wanted,
         **values,
     )
 
@@ -366,7 +371,8 @@ def _accuracy(e: Estimate) -> Iterator[Reason]:
         # Where nobody states the noise, the scatter of the residuals is what the prediction rests on.
         least = worst / (chance_of(e.left_out.freedom) if e.noise.source == "residuals" else 1.0)
         level = "PASS" if worst <= required else "WARN" if least <= required else "FAIL"
-        yield RULES["required_accuracy"].reason(level, worst=length(worst), required=length(required))
+        reached, wanted = lengths(worst, required)
+        yield RULES["required_accuracy"].reason(level, worst=reached, required=wanted)
 
 
 def _held_out(e: Estimate) -> Iterator[Reason]:
@@ -382,9 +388,10 @@ def _by_chance(v: Validation) -> float:
 
 def _validation(v: Validation, points: str, required: float) -> Iterator[Reason]:
     if v.mean >= v.before_mean:
-        yield RULES["no_gain_held_out"].reason(points=points, after=length(v.mean), before=length(v.before_mean))
+        now, was = lengths(v.mean, v.before_mean)
+        yield RULES["no_gain_held_out"].reason(points=points, after=now, before=was)
     if np.isfinite(v.predicted_rms):
-        achieved, predicted = length(v.rms), length(v.predicted_rms)
+        achieved, predicted = lengths(v.rms, v.predicted_rms)
         yield _graded(
             "predicted_and_achieved", _exceeded(v), points=points, achieved=achieved, predicted=predicted
         )

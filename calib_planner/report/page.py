@@ -22,7 +22,7 @@ from calib_planner.report.calibration import CalibrationReport, Provenance, cali
 from calib_planner.report.render import TEMPLATES, embedded, render
 from calib_planner.report.scene import still_picture
 from calib_planner.robot import is_nuisance
-from calib_planner.units import MILLI_UNIT, length, signed
+from calib_planner.units import MILLI_UNIT, length, lengths, signed
 
 HEADLINES = {
     "PASS": ("✓", "Good: apply it"),
@@ -69,6 +69,7 @@ def report_page(report: CalibrationReport) -> str:
         provenance=data["provenance"],
         value=lambda key: value_at(data, key),
         rounded=rounded,
+        one_unit=lambda keys: "mm" if max(value_at(data, k) or 0.0 for k in keys) >= 1e-3 else "µm",
         mark=mark,
         advice=advice,
         sets=charts.compared_sets(report.estimate),
@@ -114,6 +115,8 @@ def rounded(value: float, style: str) -> str:
     """A number for people: ``length`` with its unit, ``milli`` (mm, mrad), ``change`` (signed), …"""
     if style == "length":
         return "< 1 nm" if 0 < abs(value) < 1e-9 else length(value)
+    if style in ("mm", "µm"):  # one unit for what is compared, digits as in ``lengths``
+        return lengths(value, 1.0)[0] if style == "mm" else f"{1e6 * value:.3g} µm"
     if style == "milli":
         return signed(1e3 * value, 4)
     if style == "change":

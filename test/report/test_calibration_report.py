@@ -90,7 +90,7 @@ def as_number(text: str, style: str) -> tuple[float, float]:
     factor = {"µm": 1e-6, "mm": 1e-3, "%": 1e-2}.get(unit, 1e-3 if style in ("milli", "change") else 1.0)
     mantissa, _, exponent = word.lower().partition("e")
     digits = len(mantissa.partition(".")[2])
-    if style in ("length", "short"):  # three or four significant digits, zeros at the end left out
+    if style in ("length", "short", "mm", "µm"):  # three or four significant digits, zeros at the end left out
         return factor * float(word), 0.6e-2 * abs(factor * float(word)) + 1e-300
     return factor * float(word), 0.5000001 * factor * 10.0 ** (int(exponent or 0) - digits)
 
