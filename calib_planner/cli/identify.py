@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -108,8 +109,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     robot = _with_targets(robot, sources, args)
     problem = _problem(robot, sources, args, terminal)
     held_out = [_held_out(path, robot, args, replace(reading, points=())) for path in args.validate or ()]
-    with terminal.working("identifying"):
-        estimate = _estimate(problem, held_out, args)
+    with terminal.progress("identifying") as update:
+        estimate = _estimate(problem, held_out, args, update)
     settled = estimate.fit.status != "not_converged"
     written = write_outputs(args, problem, estimate) if settled else {}
     data = {"data": [{"file": s.path, "rows": len(s.data)} for s in sources.files]}
@@ -142,8 +143,13 @@ def _problem(
     )
 
 
-def _estimate(problem: IdentificationProblem, held_out: list[Measurements], args: argparse.Namespace) -> Estimate:
-    estimate = identify(problem)
+def _estimate(
+    problem: IdentificationProblem,
+    held_out: list[Measurements],
+    args: argparse.Namespace,
+    update: Callable[[float, str], None],
+) -> Estimate:
+    estimate = identify(problem, watch=update)
     if estimate.fit.status == "not_converged" or not held_out:
         return estimate
     return validate(problem, estimate, held_out, args.validate_target_from)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -70,21 +69,17 @@ class Terminal:
             transient=True,
         )
         task = bar.add_task(label, total=1.0, text="")
-        began = time.perf_counter()
-        shown = False
-
-        def update(share: float, text: str) -> None:
-            nonlocal shown
-            bar.update(task, completed=share, text=text)
-            if not shown and self.err.is_terminal and time.perf_counter() - began > PATIENCE:
-                bar.start()
-                shown = True
-
+        timer = threading.Timer(PATIENCE, bar.start)
+        timer.daemon = True
+        if self.err.is_terminal:
+            timer.start()
         try:
-            yield update
+            yield lambda share, text: bar.update(task, completed=share, text=text)
         finally:
-            if shown:
-                bar.stop()
+            timer.cancel()
+            if timer.is_alive():
+                timer.join()
+            bar.stop()
 
     @contextmanager
     def working(self, label: str) -> Iterator[None]:

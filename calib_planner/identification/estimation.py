@@ -19,7 +19,7 @@ where that would not be good enough (``update_error_model``). What a full fit sa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -101,6 +101,14 @@ BENDS = 3e-2
 """Share of a point's standard deviation that kinematics and linearisation may differ by: it is not seen."""
 OPTIONAL = ("short", "smooth", "gravity")
 """Terms that go if the left-out score is surely worse with them."""
+
+
+Watch = Callable[[float, str], None]
+"""Told what share of the work is done, 0 … 1, and what is done next."""
+
+
+def silent(share: float, text: str) -> None:
+    """Nobody watches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,6 +383,7 @@ def fit_error_model(
     robust: bool | None = None,
     choose: bool = True,
     start: ModelEstimate | None = None,
+    watch: Watch = silent,
 ) -> ModelEstimate:
     """Identify the active parameters of ``robot`` and all else that the model has.
 
@@ -387,6 +396,7 @@ def fit_error_model(
         choose: Whether terms with which the left-out score is surely worse go.
         start: An estimate of the same robot and model from most of these data, to be brought up to date: quick,
             with its scales and terms. A full fit is made where it does not do, see ``update_error_model``.
+        watch: Told what share of a full fit is done, about, and what is done next.
 
     Raises:
         NotEnoughDataError: Too few points to place tracker and targets, or they determine nothing.
@@ -396,16 +406,19 @@ def fit_error_model(
     choose = choose and not model.is_papers
     quick = None if start is None else update_error_model(robot, data, model, start, robust=robust)
     try:
-        return _estimate(robot, data, model, robust, choose) if quick is None else quick
+        return _estimate(robot, data, model, robust, choose, watch) if quick is None else quick
     except np.linalg.LinAlgError:
         need = len(robot.parameter_names)
         message = "the measured configurations do not determine the robot's place: measure more that differ"
         raise NotEnoughDataError(3 * int(data.seen.sum()), need, message) from None
 
 
-def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool) -> ModelEstimate:
+def _estimate(
+    robot: Robot, data: Measurements, model: ErrorModel, robust: bool, choose: bool, watch: Watch
+) -> ModelEstimate:
     """The same for clean arguments."""
     before = model
+    watch(0.0, "placing the robot")
     robot, far, squares = _placed(robot, data)
     model = _with_payload(model, data)
     some = _some(data)
@@ -414,13 +427,17 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
     if robust:
         work.state = replace(work.state, doubt=far if some is None else far[some])
     work.start(model)
+    watch(0.05, "fitting")
     solution = work.settle(MOST_ROUNDS)
     if robust:
+        watch(0.35, "looking for impossible points")
         solution = work.doubt(solution, squares if some is None else squares[some])
     gains: dict[str, float] = {}
     if choose:
+        watch(0.5, "trying each term")
         solution, gains = work.choose_terms(solution)
         solution = work.settle(2)
+    watch(0.7, "settling the sizes of the errors")
     if work.state.model.scales:
         solution = work.settle(MOST_ROUNDS, 0)
     if some is not None:
@@ -436,6 +453,7 @@ def _estimate(robot: Robot, data: Measurements, model: ErrorModel, robust: bool,
         if robust:
             solution = whole.reconsider(solution, 2, 0)
         work = whole
+    watch(0.9, "predicting visits left out")
     scales = scale_covariance(solution)
     covariance = _covariance(solution, scales)
     left = left_out(solution, work.groups)

@@ -40,8 +40,10 @@ from calib_planner.identification.estimate import (
 )
 from calib_planner.identification.estimation import (
     ModelEstimate,
+    Watch,
     fit_error_model,
     placement_alone,
+    silent,
     update_error_model,
 )
 from calib_planner.identification.left_out import LeftOut
@@ -64,7 +66,7 @@ WEAK = 1e-2
 
 
 @one_thread
-def identify(problem: IdentificationProblem, start: Estimate | None = None) -> Estimate:
+def identify(problem: IdentificationProblem, start: Estimate | None = None, watch: Watch = silent) -> Estimate:
     """Identify the active parameters and all else that the error model has.
 
     Args:
@@ -73,6 +75,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
             to date at its own scales and terms: many times quicker. A full fit is made where that does not do.
             ``residuals.before``, ``observability.resolved_by_prior`` and ``nearly_dependent`` of an update are
             those of the start.
+        watch: Told what share of a full fit is done, 0 … 1, about, and what is done next.
 
     Raises:
         NotEnoughDataError: Fewer equations than unknown parameters, or most points disagree.
@@ -82,7 +85,7 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
     mistake = None if start is not None else explain_gross(problem.robot, problem.data)
     _refuse_units(mistake)
     try:
-        estimate = _identify(problem, start, mistake, began)
+        estimate = _identify(problem, start, mistake, began, watch)
     except NotEnoughDataError as error:
         if mistake is None:
             raise
@@ -92,7 +95,11 @@ def identify(problem: IdentificationProblem, start: Estimate | None = None) -> E
 
 
 def _identify(
-    problem: IdentificationProblem, start: Estimate | None, mistake: Alternative | None, began: float
+    problem: IdentificationProblem,
+    start: Estimate | None,
+    mistake: Alternative | None,
+    began: float,
+    watch: Watch,
 ) -> Estimate:
     """The estimate without its verdict; ``mistake``: what is grossly wrong with the data."""
     check_count(problem, problem.data.seen)
@@ -103,11 +110,12 @@ def _identify(
     # A fit may run so far along what it cannot see that it seems to see it: this is decided first at the start.
     rows = np.repeat(problem.data.seen, 3, axis=1)
     hidden = _hidden(problem.model, robot, robot.jacobian(problem.data.q)[rows])
-    fit = _fit(problem, robot, hidden)
+    fit = _fit(problem, robot, hidden, watch)
     if fit.knowledge.hidden.shape[1]:
         poses = fit.knowledge.poses(problem.data.q, problem.data.payload)
         hidden = _hidden(problem.model, robot, poses.jacobian[rows])
-        fit = _fit(problem, robot, hidden)
+        fit = _fit(problem, robot, hidden, watch)
+    watch(0.95, "looking for other explanations")
     check_count(problem, problem.data.seen & (fit.doubt == 0.0))
     alternatives: tuple[Alternative, ...] = ()
     if mistake is not None:
@@ -260,11 +268,11 @@ def _blind_poses(problem: IdentificationProblem, robot: Robot, directions: Float
     return np.asarray((np.linalg.norm(felt, axis=1) > 10.0 * seen + BLIND).any(axis=1))
 
 
-def _fit(problem: IdentificationProblem, robot: Robot, hidden: Identifiability) -> ModelEstimate:
+def _fit(problem: IdentificationProblem, robot: Robot, hidden: Identifiability, watch: Watch) -> ModelEstimate:
     """The fit without one parameter of each hidden combination; these are in no part of it."""
     free = tuple(n for i, n in enumerate(robot.parameter_names) if i not in hidden.fixed)
     seen = replace(robot, parameter_names=free or robot.parameter_names)
-    return fit_error_model(seen, problem.data, problem.model, robust=problem.robust)
+    return fit_error_model(seen, problem.data, problem.model, robust=problem.robust, watch=watch)
 
 
 def _with_fixed(known: Knowledge, names: tuple[str, ...]) -> Knowledge:
