@@ -59,6 +59,8 @@ from calib_planner.robot import (
     dh_levels,
     parse_coupling,
     pose_elements,
+    pose_of,
+    re_placed,
     register_file_reader,
     rotation,
     target_elements,
@@ -146,9 +148,10 @@ def _robot(top: Node) -> Robot:
     joints = [joint.mapping(JOINT_KEYS, ("name", "lower", "upper")) for joint in top["joints"].items()]
     names = tuple(joint["name"].name() for joint in joints)
     check_joint_names(top.path, names)
-    chain, levels = _chain(top, names)
+    chain, levels, stated, remarks = _chain(top, names)
     given = top["masses"].items() if "masses" in top else []
-    masses = tuple(_mass(node, names, chain, "elements" in top) for node in given)
+    masses = tuple(_mass(node, names, stated, "elements" in top) for node in given)
+    masses = tuple(_moved(mass, stated, chain) for mass in masses) if remarks else masses
     chain = [*_base(top.get("base", {})), *_with_placement_errors(chain, names)]
     full = tuple(f"{names[e.joint]}.{x}" for e in chain if e.joint is not None for x in PLACEMENT_ERRORS)
     levels = _levels(top, {**levels, "full": full}, [e.parameter for e in chain if e.parameter])
@@ -164,7 +167,6 @@ def _robot(top: Node) -> Robot:
         link_masses=masses,
     )
     limits = robot.joint_limits.copy()
-    remarks: list[str] = []
     for joint, turns in zip(joints, robot.joint_is_revolute, strict=True):
         valid = ANGLES if turns else LENGTHS
         if joint.get("unit", next(iter(valid))).value not in valid:
@@ -181,14 +183,15 @@ def _robot(top: Node) -> Robot:
     return robot.with_couplings([parse_coupling(text) for text in texts])
 
 
-def _chain(top: Node, names: Sequence[str]) -> tuple[list[Element], Levels]:
-    """The chain and the levels that it brings."""
+def _chain(top: Node, names: Sequence[str]) -> tuple[list[Element], Levels, list[Element], list[str]]:
+    """The chain, the levels that it brings, the chain as it is stated, and what was changed, in words."""
     given = [key for key in CHAINS if key in top]
     if len(given) != 1:
         raise top.error(" and ".join(given) or "no chain", f"exactly one of: {', '.join(CHAINS)}")
     if given != ["elements"]:
         return _table(top[given[0]], names, modified=given == ["modified_dh"])
-    return [_element(entry, names) for entry in top["elements"].items()], {}
+    chain = [_element(entry, names) for entry in top["elements"].items()]
+    return chain, {}, chain, []
 
 
 def _element(entry: Node, joint_names: Sequence[str]) -> Element:
@@ -209,7 +212,9 @@ def _joint_name(node: Node, joint_names: Sequence[str]) -> str:
     return Node(node.path, node.where, node.name()).choice(joint_names)
 
 
-def _table(table: Node, names: Sequence[str], *, modified: bool) -> tuple[list[Element], Levels]:
+def _table(
+    table: Node, names: Sequence[str], *, modified: bool
+) -> tuple[list[Element], Levels, list[Element], list[str]]:
     table.mapping(TABLE_KEYS, ("rows",))
     length = LENGTHS[table.get("length_unit", "m").choice(LENGTHS)]
     angle = ANGLES[table.get("angle_unit", "rad").choice(ANGLES)]
@@ -218,7 +223,10 @@ def _table(table: Node, names: Sequence[str], *, modified: bool) -> tuple[list[E
     check_joint_names(table.path, [row.joint for row in rows])
     for name in set(names).difference(row.joint for row in rows):
         raise table["rows"].error(f"no row of joint {name!r}", "one row for every joint")
-    return list(dh_elements(rows, names, modified=modified)), dh_levels(rows, modified=modified)
+    new, words = re_placed(rows, modified=modified)
+    stated = list(dh_elements(rows, names, modified=modified))
+    chain = list(dh_elements(new, names, modified=modified)) if words else stated
+    return chain, dh_levels(new, modified=modified), stated, words
 
 
 def _row(entry: Node, names: Sequence[str], scales: Mapping[str, float]) -> DhRow:
@@ -268,6 +276,17 @@ def _mass(node: Node, names: Sequence[str], chain: Sequence[Element], by_element
             place = rotation(e.axis, shift) @ place if e.is_rotation else place + shift * np.eye(3)[e.axis]
     x, y, z = (float(v) for v in place)
     return LinkMass(joint, mass, (x, y, z))
+
+
+def _moved(mass: LinkMass, stated: Sequence[Element], chain: Sequence[Element]) -> LinkMass:
+    """The mass of a table in the frame that its joint has in the re-placed table."""
+    places = []
+    for elements in (stated, chain):
+        end = next(i for i, e in enumerate(elements) if e.joint == mass.joint) + 1
+        places.append(pose_of(elements[:end]))
+    (turn, place), (new_turn, new_place) = places
+    x, y, z = (float(v) for v in new_turn.T @ (place + turn @ mass.xyz - new_place))
+    return replace(mass, xyz=(x, y, z))
 
 
 def _base(node: Node) -> tuple[Element, ...]:

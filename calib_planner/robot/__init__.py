@@ -15,6 +15,7 @@ from calib_planner.robot.elements import (
     dh_elements,
     dh_levels,
     pose_elements,
+    re_placed,
     roll_pitch_yaw,
     rotation,
 )
@@ -23,7 +24,14 @@ from calib_planner.robot.inverse import Goals, goals_of, residuals, solve
 from calib_planner.robot.limits import believable_limits
 from calib_planner.robot.linearisation import Layout, Linearisation, Posture
 from calib_planner.robot.masses import LinkMass, lumped
-from calib_planner.robot.origins import JointOrigins, Origin, joint_origins, not_in_origins, with_origins
+from calib_planner.robot.origins import (
+    JointOrigins,
+    Origin,
+    joint_origins,
+    not_in_origins,
+    pose_of,
+    with_origins,
+)
 from calib_planner.robot.parameters import (
     BASE,
     BASE_PARAMETERS,

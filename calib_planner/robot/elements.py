@@ -22,12 +22,24 @@ Modified (proximal: Khalil and Kleinfinger 1986, Craig), with joint i about or a
 The table's θ of a revolute joint and d of a prismatic one are constants to which sign · q is added. All four
 are named parameters, ``<joint>.theta``, ``.d``, ``.a`` and ``.alpha``, and their values are the table's: what
 is identified goes straight back into it, whatever the joint's sign.
+
+Where two consecutive axes are nearly parallel, by an angle α ≠ 0, their common normal is far away and leaps with
+every tilt: tables of calibrated arms have d of hundreds of metres there, with the opposite d in the next row. No
+fit of these numbers succeeds. ``re_placed`` turns such a link to Hayati's form (Hayati and Mirmirani 1985), in
+which d is zero and a second tilt β takes its place. Motions about z commute with shifts and turns along z, so
+that
+
+    Tz(d) Tx(a) Rx(α)  =  Rz(Δ) Tx(a') Rx(α') Ry(β') Rz(γ) Tz(−c) ,     c = −d / cos α ,
+
+is the same robot: the link's end is moved along the second axis into the plane through the first frame that is
+perpendicular to the first axis. There it stands at (a, d tan α), at the distance a' and turned by Δ. Δ goes to θ
+of the joint before, γ and −c to θ and d of the joint behind.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -132,6 +144,7 @@ class DhRow:
         a: Length of the common normal [m].
         alpha: Twist of the common normal [rad].
         sign: +1, or −1 for a joint that counts against its axis; 1 for a fixed row.
+        beta: Second tilt of a link in Hayati's form, ``None`` in any other [rad].
     """
 
     joint: str
@@ -141,6 +154,7 @@ class DhRow:
     a: float = 0.0
     alpha: float = 0.0
     sign: float = 1.0
+    beta: float | None = None
 
 
 def dh_elements(rows: Sequence[DhRow], joint_names: Sequence[str], *, modified: bool) -> tuple[Element, ...]:
@@ -156,6 +170,8 @@ def dh_elements(rows: Sequence[DhRow], joint_names: Sequence[str], *, modified: 
                 elements.append(Element(kind, value, joint=index, parameter=name))
             else:  # an element's sign turns its constant too, and the table's constant is not to be turned
                 elements += [Element(kind, joint=index, sign=-1.0), Element(kind, value, parameter=name)]
+            if row.beta is not None and quantity == ("a" if modified else "alpha"):
+                elements.append(Element("Ry", row.beta, parameter=f"{row.joint}.beta"))
     return tuple(elements)
 
 
@@ -163,7 +179,8 @@ def dh_levels(rows: Sequence[DhRow], *, modified: bool) -> dict[str, tuple[str, 
     """Parameters of the levels ``offsets``, ``lengths`` and ``dh``, each in chain order.
 
     ``offsets`` is the joints' zeros: θ of revolute and d of prismatic joints. ``lengths`` is the other a and d
-    that are not zero: a zero is a matter of how the frames were laid. ``dh`` is every θ, d, a and α.
+    that are not zero: a zero is a matter of how the frames were laid. ``dh`` is every θ, d, a and α; of a link in
+    Hayati's form β instead of the d before it.
     """
     order = [quantity for _, quantity in (MODIFIED if modified else STANDARD)]
     lengths = [
@@ -175,5 +192,60 @@ def dh_levels(rows: Sequence[DhRow], *, modified: bool) -> dict[str, tuple[str, 
     return {
         "offsets": tuple(f"{row.joint}.{MOVES[row.type]}" for row in rows if row.type in MOVES),
         "lengths": tuple(lengths),
-        "dh": tuple(f"{row.joint}.{quantity}" for row in rows for quantity in order),
+        "dh": tuple(name for names in _table_names(rows, order, modified=modified) for name in names),
     }
+
+
+def _table_names(rows: Sequence[DhRow], order: Sequence[str], *, modified: bool) -> list[list[str]]:
+    """Per row the parameters of the level ``dh``."""
+    names = [[f"{row.joint}.{quantity}" for quantity in order] for row in rows]
+    for at, row in enumerate(rows):
+        if row.beta is not None:
+            names[at].append(f"{row.joint}.beta")
+            first = at - 1 if modified else at
+            names[first].remove(f"{rows[first].joint}.d")
+    return names
+
+
+NEARLY_PARALLEL = 0.05
+"""Axes within this angle of parallel have no common normal that could be relied on: manufacturing errors of a
+milliradian turn it by a degree and more [rad]."""
+
+
+def re_placed(rows: Sequence[DhRow], *, modified: bool) -> tuple[list[DhRow], list[str]]:
+    """The table with Hayati's form for links between nearly parallel axes, and which they are, in words.
+
+    Axes that are exactly parallel stay as they are: any common normal will do.
+    """
+    new = list(rows)
+    words: list[str] = []
+    for at in range(len(new) - 1):
+        before, behind = new[at], new[at + 1]
+        alpha = (behind if modified else before).alpha
+        tilt = abs(np.sin(alpha))
+        if {before.type, behind.type} != {"revolute"} or not 1e-12 < tilt < NEARLY_PARALLEL:
+            continue
+        a = (behind if modified else before).a
+        turn, reach, twist, beta, rest, shift = _hayati(before.d, a, alpha)
+        before = replace(before, theta=before.theta + turn, d=0.0)
+        behind = replace(behind, theta=behind.theta + rest, d=behind.d + shift)
+        link = replace(behind if modified else before, a=reach, alpha=twist, beta=beta)
+        new[at : at + 2] = [before, link] if modified else [link, behind]
+        instead = f"{link.joint}.beta instead of {before.joint}.d"
+        words.append(
+            f"the axes of {before.joint} and {behind.joint} are parallel to {1e3 * tilt:.3g} mrad: their rows "
+            f"are re-placed by Hayati's convention ({instead}); identified values are those of the new rows"
+        )
+    return new, words
+
+
+def _hayati(d: float, a: float, alpha: float) -> tuple[float, float, float, float, float, float]:
+    """Δ, a', α', β', γ and −c of the equation at the top of this file."""
+    aside = d * np.tan(alpha)
+    turn = float(np.arctan2(aside, a))
+    # Rx(α') Ry(β') Rz(γ) = Rz(−Δ) Rx(α): the first row and the last column hold the angles.
+    matrix = rotation(2, -turn) @ rotation(0, alpha)
+    twist = float(np.arctan2(-matrix[1, 2], matrix[2, 2]))
+    beta = float(np.arcsin(np.clip(matrix[0, 2], -1.0, 1.0)))
+    rest = float(np.arctan2(-matrix[0, 1], matrix[0, 0]))
+    return turn, float(np.hypot(a, aside)), twist, beta, rest, float(d / np.cos(alpha))

@@ -77,7 +77,7 @@ def joint_origins(robot: Robot) -> JointOrigins:
     return JointOrigins(
         joints={s.name: _origin(robot.elements, s) for s in spans},
         axes={s.name: _axis(robot.elements, s) for s in spans},
-        tip=None if end is None else _as_origin(*_pose(robot.elements[end:])),
+        tip=None if end is None else _as_origin(*pose_of(robot.elements[end:])),
     )
 
 
@@ -172,9 +172,9 @@ def _joint_name(robot: Robot, motion: int) -> str:
 
 def _origin(elements: Sequence[Element], span: _Span) -> Origin:
     pose, motion = elements[span.first : span.turn], elements[span.motion]
-    turn, _ = _pose(elements[span.turn : span.motion])
-    moved, shift = _pose((replace(motion, joint=None),))
-    r, p = _pose(pose)
+    turn, _ = pose_of(elements[span.turn : span.motion])
+    moved, shift = pose_of((replace(motion, joint=None),))
+    r, p = pose_of(pose)
     xyz: FloatArray = p + r @ turn @ shift
     rpy = roll_pitch_yaw(r @ turn @ moved @ turn.T)
     if tuple(e.kind for e in pose) == POSE_KINDS:  # numbers that stay, stay to the bit
@@ -185,12 +185,12 @@ def _origin(elements: Sequence[Element], span: _Span) -> Origin:
 
 
 def _axis(elements: Sequence[Element], span: _Span) -> FloatArray:
-    turn, _ = _pose(elements[span.turn : span.motion])
+    turn, _ = pose_of(elements[span.turn : span.motion])
     motion = elements[span.motion]
     return frozen(motion.sign * turn[:, motion.axis] + 0.0)
 
 
-def _pose(elements: Sequence[Element]) -> tuple[FloatArray, FloatArray]:
+def pose_of(elements: Sequence[Element]) -> tuple[FloatArray, FloatArray]:
     """Rotation (3, 3) and position (3,) [m] after these elements, joints at zero."""
     r: FloatArray = np.eye(3)
     p: FloatArray = np.zeros(3)

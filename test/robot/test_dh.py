@@ -12,6 +12,7 @@ from robots import SHARED_DATA, random_configurations
 
 from calib_planner import FileFormatError, IdentificationProblem, Robot, identify
 from calib_planner.error_model import ErrorModel
+from calib_planner.error_model.gravity import link_points
 from calib_planner.simulation import SimulatedCell
 
 STEP = 1e-30
@@ -249,6 +250,78 @@ def test_parallel_axes_hide_their_d_and_the_twist_between_them(tmp_path):
     )
     values = dict(zip(found.fit.parameters, found.fit.deviations, strict=True))
     assert values["j2.d"] + values["j3.d"] == pytest.approx(1.5e-3, abs=2e-5)
+
+
+def nearly_parallel(tilt):
+    """An arm of six joints whose axes 2, 3 and 4 are parallel to ``tilt`` rad, as in tables of calibrated arms.
+
+    The common normals lead 40 mm aside, for which a d of 0.04 m / ``tilt`` is needed.
+    """
+    far = float(0.04 / np.tan(tilt))
+    return [
+        {"joint": "j1", "d": 0.4, "alpha": 1.5707},
+        {"joint": "j2", "theta": 0.1, "d": far, "a": 0.6, "alpha": tilt},
+        {
+            "joint": "j3",
+            "theta": -0.2,
+            "d": float(-far / np.cos(tilt)) + 0.02,
+            "a": 0.55,
+            "alpha": -tilt,
+            "sign": -1,
+        },
+        {"joint": "j4", "d": 0.1, "alpha": -1.571},
+        {"joint": "j5", "d": 0.12, "alpha": 1.57},
+        {"joint": "j6", "d": 0.09, "alpha": -1.57},
+    ]
+
+
+TILTS = (1e-6, 1e-5, 1e-4, 1e-3, np.pi - 1e-4)
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+def test_nearly_parallel_axes_are_re_placed(tmp_path, key, tilt):
+    """The same robot, without rows of hundreds of metres, and with the tilt that the table lacks."""
+    rows, joints = nearly_parallel(tilt), [f"j{i}" for i in range(1, 7)]
+    masses = [{"joint": f"j{i}", "mass": 1.0, "xyz": [0.01, 0.02, 0.03]} for i in (1, 2, 3, 4)]
+    robot = Robot.load(write(tmp_path, key, rows, targets=TARGETS, masses=masses))
+    q = random_configurations(robot, 12)
+    expected = by_matrices(key, rows, joints, q, TARGETS)
+    np.testing.assert_allclose(
+        robot.positions(q).reshape(12, -1), expected, atol=1e-15 * 0.4 / np.sin(tilt) + 1e-13
+    )
+    pairs = (("j2", "j3"), ("j3", "j4")) if key == "dh" else (("j1", "j2"), ("j2", "j3"))
+    assert [
+        all(f"axes of {a} and {b} are" in r for a, b in [pair])
+        for pair, r in zip(pairs, robot.remarks, strict=True)
+    ]
+    assert np.abs(robot.posture(q).joint_origins).max() < 2.5, "no frame is far from the arm"
+    full, table = (
+        robot.with_parameters(names, ("base", "tool")).jacobian(random_configurations(robot, 60)).reshape(360, -1)
+        for names in ("full", "dh")
+    )
+    left = full - table @ np.linalg.lstsq(table, full, rcond=1e-10)[0]
+    assert np.abs(left).max() < 1e-6, "the rows describe every error of the arm"
+    for part in robot.link_masses:  # in the frame of its row, which is behind row part.joint for either form
+        own = by_matrices(
+            key, rows[: part.joint + 1], joints[: part.joint + 1], q[:, : part.joint + 1], [[0.01, 0.02, 0.03]]
+        )
+        np.testing.assert_allclose(
+            link_points(robot, q, part.joint, part.xyz), own, atol=1e-14 / np.sin(tilt) + 1e-12
+        )
+
+
+@pytest.mark.parametrize("tilt", TILTS[:4])
+def test_a_fit_of_nearly_parallel_axes_succeeds(tmp_path, key, tilt):
+    """The truth tilts the axes by a milliradian: common normals leap, and the fit does not care."""
+    robot = Robot.load(write(tmp_path, key, nearly_parallel(tilt), targets=TARGETS))
+    q = random_configurations(robot, 70, 5)
+    errors = {"j2.rx": 1e-3, "j3.ry": -1e-3, "j3.rx": 7e-4, "j4.ry": 5e-4, "j2.x": 5e-4, "j4.rx": -8e-4}
+    cell = SimulatedCell(robot.with_parameters("full"), errors, 1e-6, error_model=ErrorModel.paper())
+    asked = robot.with_parameters("dh", ("base", "tool"))
+    estimate = identify(IdentificationProblem(asked, cell.measure(q[:40], 1, 0), 1e-6, ErrorModel.paper()))
+    assert estimate.fit.status != "not_converged"
+    fresh = estimate.calibrated.positions(q[40:]) - robot.with_deviations(errors).positions(q[40:])
+    assert np.linalg.norm(fresh, axis=2).max() < 2e-5
 
 
 def test_the_example_of_the_conventions_page(tmp_path):
