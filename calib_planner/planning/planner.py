@@ -8,9 +8,10 @@ geometric means of efficiencies, so their parts' approximate designs are compute
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +41,7 @@ from calib_planner.planning.result import STATUS, Plan, PlannedTerm, PlanQuality
 from calib_planner.planning.search.enumeration import best_of_all
 from calib_planner.planning.search.exchange import ChoiceProblem, check_choice, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
-from calib_planner.planning.search.rounding import heaviest_places, improved, rounded
+from calib_planner.planning.search.rounding import heaviest_places, improved, rounded_rows
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
 
@@ -110,12 +111,12 @@ def plan(
     if design is not None:
         design, proof = _proven(space, target, design, np.random.default_rng(own.spawn(1)[0]), clock, prove)
     clock.tell(bound=design.bound if design else None)
-    best: _Bound | None = None
+    best, rounded = None, _Rounded(space, criterion, design)
     if problem.candidates is not None:
         result, best = _choose(space, criterion, target, design, rng, clock)
     else:
-        result = _search(space, criterion, design, seeds, clock, executor)
-    return _assemble(space, target, design, proof, best, result, clock)
+        result = _search(space, criterion, design, seeds, rounded, clock, executor)
+    return _assemble(space, target, design, proof, best, rounded, result, clock)
 
 
 @one_thread
@@ -148,7 +149,8 @@ def judged(
         design = _approximate(space, target, rng, clock.over)
         design, proof = _proven(space, target, design, rng, clock, False)
     work = (0, 0) if searched is None else (searched.quality.starts, searched.quality.evaluations)
-    made = _assemble(space, target, design, proof, None, SearchResult(configurations, np.nan, *work), clock, True)
+    result, rounded = SearchResult(configurations, np.nan, *work), _Rounded(space, target, design)
+    made = _assemble(space, target, design, proof, None, rounded, result, clock, True)
     return made if searched is None else _as_searched(made, searched.quality)
 
 
@@ -287,6 +289,7 @@ def _search(
     criterion: Criterion,
     design: ApproximateDesign | None,
     seeds: list[np.random.SeedSequence],
+    rounded: _Rounded,
     clock: _Clock,
     executor: Executor | None,
 ) -> SearchResult:
@@ -329,7 +332,7 @@ def _search(
         future.cancel()
     assert best is not None
     if not clock.over() and (is_sharp(criterion) or not _good_enough(space, design, best)):
-        plans = [best.configurations, *_roundings(space, criterion, design)]
+        plans = [best.configurations, *rounded.plans]
         result = improved(search, np.stack(plans), clock.over)
         evaluations += result.evaluations
         if is_sharp(criterion) or result.log_value > best.log_value:
@@ -337,18 +340,29 @@ def _search(
     return replace(best, starts=done, evaluations=evaluations)
 
 
-def _roundings(space: PlanSpace, criterion: Criterion, design: ApproximateDesign | None) -> list[FloatArray]:
-    """Whole-number plans (m, joints) at the configurations of the approximate design."""
-    if design is None:
-        return []
-    low, high = space.robot.joint_limits.T
-    request = replace(_choice(space, criterion, design.support, design), repeat=True)
-    places = heaviest_places(design.support, design.weights, high - low)
-    try:
-        rows = rounded(request, places, np.random.default_rng(space.problem.search.seed))
-    except InfeasibleError:  # some of its weight is on the spread that keeps it regular
-        return []
-    return [design.support[each] for each in rows]
+@dataclass(frozen=True, eq=False)
+class _Rounded:
+    """Whole-number plans at the configurations of the approximate design."""
+
+    space: PlanSpace
+    criterion: Criterion
+    design: ApproximateDesign | None
+
+    @cached_property
+    def plans(self) -> list[FloatArray]:
+        """Some (m, joints); none with candidates, where exchange starts from such a plan anyway."""
+        space, design = self.space, self.design
+        if design is None or np.ndim(space.model.repetitions) or space.problem.candidates is not None:
+            return []
+        request = _choice(space, self.criterion, design.support, design)
+        request = replace(request, beside=tuple(_scaled_choices(space, self.criterion, request)), repeat=True)
+        low, high = space.robot.joint_limits.T
+        places = heaviest_places(design.support, design.weights, high - low)
+        try:
+            rows = rounded_rows(request, places, np.random.default_rng(space.problem.search.seed))
+        except InfeasibleError:  # some of its weight is on the spread that keeps it regular
+            return []
+        return [design.support[each] for each in rows]
 
 
 def _agreed(tops: list[float]) -> bool:
@@ -380,9 +394,7 @@ def _choose(
     request = _choice(space, criterion, allowed, design)
     check_choice(request)
     if request.together is not None:
-        others = spread_spaces(space)
-        beside = (_choice(s, _criterion_of(s, criterion), allowed, design) for s in others)
-        request = replace(request, beside=tuple(beside))
+        request = replace(request, beside=tuple(_scaled_choices(space, criterion, request)))
     one = criterion is target or problem.criterion != "test_pose" or problem.general_weight == 0.0
     exact = replace(request, criterion=target) if one else request
     every = best_of_all(exact, target, lambda matrix: _psi_of_matrix(space, target, matrix), clock.over)
@@ -417,6 +429,14 @@ def _choice(
     )
 
 
+def _scaled_choices(space: PlanSpace, criterion: Criterion, request: ChoiceProblem) -> Iterator[ChoiceProblem]:
+    """The same choice for other sizes of the errors."""
+    for other in spread_spaces(space):
+        assert isinstance(other.model, ExtendedModel)
+        wanted = _criterion_of(other, criterion)
+        yield replace(request, criterion=wanted, prior=other.prior, factor=other.model.factor, beside=())
+
+
 def _criterion_of(space: PlanSpace, criterion: Criterion) -> Criterion:
     """The criterion of the search in another space of the same problem."""
     return space.search_criterion() if not space.problem.compound else criterion
@@ -431,6 +451,7 @@ def _assemble(
     design: ApproximateDesign | None,
     proof: Proof | None,
     best: _Bound | None,
+    rounded: _Rounded,
     result: SearchResult,
     clock: _Clock,
     given: bool = False,
@@ -452,7 +473,7 @@ def _assemble(
     # For the paper's criterion Ψ is that of the figure reported, to the last digit.
     floor = float(shares @ space.test_floor) if plain else 0.0
     psi = accuracy**-2 if plain else psi_of(space, target, configurations)
-    bound = best or _bound(space, target, design, proof, configurations)
+    bound = best or _bound(space, target, design, proof, configurations, rounded)
     bound = _checked(bound.above(floor), psi)
     name = "compound" if problem.compound else problem.criterion
     size, n = len(space.interest), space.measurements
@@ -548,6 +569,7 @@ def _bound(
     design: ApproximateDesign | None,
     proof: Proof | None,
     configurations: FloatArray,
+    rounded: _Rounded,
 ) -> _Bound:
     """The bound on Ψ of the design, raised where the plan shows that its maximisation had missed something."""
     if design is None:
@@ -564,22 +586,14 @@ def _bound(
     if not proven:
         text += f" Further starts of the maximisation raised the bound by less than {100 * missed:.1g} %."
     power = 0.5 if space.problem.criterion in POSE_CRITERIA and not space.problem.compound else 1.0
-    rounded = float("nan")
-    equal = np.ndim(space.model.repetitions) == 0
-    if equal and 0.0 < psi < UNEXPLAINED ** (1.0 / power) * design.bound:
-        rounded = (_rounded(space, target, design) / design.bound) ** power
-    if np.isfinite(rounded):
-        text += (
-            " The bound may divide visits, which no plan can: rounded to whole ones at its own configurations,"
-            f" its design has efficiency {rounded:.3f}."
-        )
-    return _Bound(design.bound, "proven" if proven else "numerical", missed, rounded, text)
-
-
-def _rounded(space: PlanSpace, target: Criterion, design: ApproximateDesign) -> float:
-    """Ψ of the best whole-number plan that is known at the configurations of the design."""
-    wanted = target if space.problem.compound else space.search_criterion()
-    return max((psi_of(space, target, q) for q in _roundings(space, wanted, design)), default=float("nan"))
+    share = float("nan")
+    if 0.0 < psi < UNEXPLAINED ** (1.0 / power) * design.bound:
+        text += " The bound may divide visits among any number of configurations, which no plan can"
+        best = max((psi_of(space, target, q) for q in rounded.plans), default=share)
+        share = (best / design.bound) ** power
+        where = f": its design has efficiency {share:.3f} when rounded to whole visits where it is"
+        text += f"{where if np.isfinite(share) else ''}."
+    return _Bound(design.bound, "proven" if proven else "numerical", missed, share, text)
 
 
 def _terms(space: PlanSpace, inverse: FloatArray) -> tuple[PlannedTerm, ...]:

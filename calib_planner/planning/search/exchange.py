@@ -21,15 +21,23 @@ eliminated, log det S = log det M − log det M_nn is two of them. Rows are scal
 candidates' mean information, which changes log det M by a constant. Other criteria try a shortlist of
 first-order best.
 
-With a whole error model configurations share errors, and what a candidate tells depends on the others (see
-``extended``). The shortlist then holds the candidates that are largest in the sensitivity seen from the choice,
-and a trial takes what the candidate adds to the other rows.
+With a whole error model configurations share errors, V being their covariance, and what a candidate tells depends
+on the others (see ``extended``). With P = V⁻¹, Z = P X of the m rows chosen and M = M_0 + XᵀZ, row i tells
+
+    M − M_{-i} = Z_iᵀ P_ii⁻¹ Z_i ,     V_{-i}⁻¹ = P − P_{·i} P_ii⁻¹ P_{i·} ,                                  (3)
+
+and candidate j adds UᵀU to that, U being the rows X_j − K_j V_{-i}⁻¹ X whitened by their own covariance, with K_j
+what j and the chosen rows have in common. K_j of all candidates changes by one block with every exchange, so
+that a trial costs a product with the p coefficients. Which candidates are tried is told by the sensitivity seen
+from the choice, X̃_j = X_j − K_j Z, (2) of ``extended``, for the largest directions of the gradient. Other
+sizes of the errors (``scaled``) change V and the columns by a factor only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -152,6 +160,7 @@ class ChoiceProblem:
         weights: (C,) weights of the approximate design, to start from, or empty.
         names: p names of the parameters, for messages.
         together: The candidates where they share errors, else ``None``; ``rows`` is then each of them alone.
+        factor: f, by which the errors of the joints are larger than in ``together``.
         beside: The same problem for other sizes of the robot's errors, where candidates share errors: the choice
             is improved for the mean of log Ψ over all of them.
     """
@@ -164,6 +173,7 @@ class ChoiceProblem:
     weights: FloatArray = field(default_factory=lambda: np.empty(0))
     names: tuple[str, ...] = ()
     together: LinearisedExtension | None = None
+    factor: float = 1.0
     beside: tuple[ChoiceProblem, ...] = ()
 
 
@@ -250,7 +260,7 @@ def _rounded(problem: ChoiceProblem) -> IntArray:
 def information_of(problem: ChoiceProblem, choices: IntArray) -> FloatArray:
     """M (S, p, p) of choices (S, size)."""
     if problem.together is not None and choices.size:
-        return problem.prior + problem.together.rows(choices.ravel()).sums(choices.shape[1])
+        return problem.prior + problem.together.rows(choices.ravel()).sums(choices.shape[1], problem.factor)
     own = problem.rows[choices].reshape(len(choices), -1, problem.rows.shape[2])
     return problem.prior + np.swapaxes(own, 1, 2) @ own
 
@@ -404,60 +414,189 @@ class _Shortlisted:
 # ── candidates that share errors ─────────────────────────────────────────────────────────────────────
 
 
+DIRECTIONS = 0.999
+"""Share of the trace of an accuracy's weight that the directions have by which candidates are ranked."""
+
+
+class _Chosen:
+    """The rows chosen, for one size of the errors: (3)."""
+
+    def __init__(self, problem: ChoiceProblem, shared: _Shared, rows: IntArray) -> None:
+        self.problem, factor = problem, problem.factor
+        r, m = shared.r, len(rows)
+        self.columns = shared.columns[rows].reshape(m * r, shared.columns.shape[2]) * shared.scales(factor)
+        self.covariance = np.zeros((m, r, m, r))
+        every = np.arange(m)
+        self.covariance += factor**2 * shared.cross[rows][:, :, :m]
+        self.covariance[every, :, every, :] += shared.points[rows] + factor**2 * shared.visits[rows]
+        self.inverse = np.linalg.inv(self.covariance.reshape(m * r, m * r))
+        self.solved = self.inverse @ self.columns
+        self.matrix = problem.prior + self.columns.T @ self.solved
+        self.shared, self.r, self.size = shared, r, m
+
+    @cached_property
+    def hidden(self) -> FloatArray:
+        """(p, p) M⁻¹, M with a ridge."""
+        return np.asarray(np.linalg.inv(slightly_ridged(self.matrix[None])[0]))
+
+    def added(self, new: IntArray, position: int | None) -> FloatArray:
+        """(K, r, p) rows U of what each of ``new`` (K,) adds to the choice without the row at ``position``."""
+        shared, factor, r = self.shared, self.problem.factor, self.r
+        inverse = self.inverse
+        if position is not None:
+            place = slice(position * r, (position + 1) * r)
+            inverse = inverse - inverse[:, place] @ np.linalg.solve(inverse[place, place], inverse[place])
+        cross = factor**2 * shared.cross[new][:, :, : self.size].reshape(len(new) * r, -1)
+        weights = cross @ inverse
+        left = shared.columns[new] * shared.scales(factor) - (weights @ self.columns).reshape(len(new), r, -1)
+        met = weights.reshape(len(new), r, -1) @ np.swapaxes(cross.reshape(len(new), r, -1), 1, 2)
+        alone = shared.points[new] + factor**2 * (shared.visits[new] + shared.own[new]) - met
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(alone), left))
+
+    def with_one_more(self, new: IntArray, position: int) -> FloatArray:
+        """log Ψ (K,) with each of ``new`` (K,) in the place of the row at ``position``.
+
+        For accuracies 1/tr(A M⁻¹) by Woodbury's identity, C being the inverse without the row:
+        tr A (C⁻¹ + UᵀU)⁻¹ = tr A C − tr (I + U C Uᵀ)⁻¹ U C A C Uᵀ.
+        """
+        added = self.added(new, position)
+        place = slice(position * self.r, (position + 1) * self.r)
+        own, gone = self.inverse[place, place], self.solved[place]
+        criterion = self.problem.criterion
+        if not isinstance(criterion, Accuracy):
+            left = self.matrix - gone.T @ np.linalg.solve(own, gone)
+            return log_values_of(self.problem, left + np.swapaxes(added, 1, 2) @ added)
+        seen = gone @ self.hidden
+        inverse = self.hidden + seen.T @ np.linalg.solve(own - seen @ gone.T, seen)
+        half = added @ inverse
+        inner = np.eye(self.r) + half @ np.swapaxes(added, 1, 2)
+        gained = np.linalg.solve(inner, half @ criterion.weight @ np.swapaxes(half, 1, 2))
+        rest = np.sum(criterion.weight * inverse) - np.einsum("kii->k", gained)
+        return np.where(rest > 0.0, -np.log(np.maximum(rest, 1e-300)), -np.inf)
+
+
+class _Shared:
+    """What all candidates have in common with the rows chosen, and each alone.
+
+    Attributes:
+        columns: (C, r, p) X.
+        points: (C, r, r) what is new at each visit and point, without the joints' part [m²].
+        visits: (C, r, r) what the joints err anew at each visit [m²].
+        own: (C, r, r) what the eliminated functions move it by [m²].
+        cross: (C, r, m, r) what these have in common with each row chosen [m²].
+    """
+
+    def __init__(self, info: LinearisedExtension, size: int) -> None:
+        self.info, self.levers, self.rest = info, info.levers, info.rest
+        self.columns, self.points = info.jacobian, info.points
+        self.count, self.r, _ = self.columns.shape
+        turned = np.swapaxes(self.levers, 1, 2)
+        self.visits = info.model.visit_variance * (self.levers @ turned)
+        self.own = (self.levers * np.sum(self.rest**2, axis=2)[:, None]) @ turned
+        self.cross = np.zeros((self.count, self.r, size, self.r))
+        self.whitener = np.linalg.inv(np.linalg.cholesky(self.points + self.visits))
+        self._scales: dict[float, FloatArray] = {}
+
+    def scales(self, factor: float) -> FloatArray:
+        """(p,) what another size of the errors makes of the columns."""
+        if factor not in self._scales:
+            self._scales[factor] = self.info.model.column_scales(factor)
+        return self._scales[factor]
+
+    def put(self, position: int, row: int) -> None:
+        """Candidate ``row`` is chosen at ``position``."""
+        kernel = np.einsum("clf,lf->cl", self.rest, self.rest[row], optimize=True)
+        self.cross[:, :, position] = (self.levers * kernel[:, None]) @ self.levers[row].T
+
+
 class _Together:
     """As ``_Exact``."""
 
     def __init__(self, problem: ChoiceProblem, info: LinearisedExtension) -> None:
-        self.problem, self.info = problem, info
+        self.problem, self.shared = problem, _Shared(info, problem.size)
         flat = problem.rows.reshape(-1, problem.rows.shape[2])
         self.average = flat.T @ flat / len(problem.rows)
+        self.root = self._directions()
+
+    def _directions(self) -> FloatArray | None:
+        """(p, k) the largest directions of an accuracy's weight, in units in which M is of the order of one."""
+        if not isinstance(self.problem.criterion, Accuracy):
+            return None
+        matrix = self.problem.prior + self.problem.size * self.average
+        units = np.sqrt(np.diag(matrix))
+        values, vectors = np.linalg.eigh(self.problem.criterion.weight / np.outer(units, units))
+        largest = np.argsort(-values)
+        share = np.cumsum(values[largest]) / values.sum()
+        kept = largest[: int(np.searchsorted(share, DIRECTIONS)) + 1]
+        return np.asarray(units[:, None] * vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)))
 
     def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         rows = self._greedy(start)
-        tried = self._exchange(rows, replace(self.problem, beside=()), cancel)
+        tried = self._exchange(rows, [self.problem], cancel)
         if self.problem.beside:
-            tried += self._exchange(rows, self.problem, cancel)
+            tried += self._exchange(rows, [self.problem, *self.problem.beside], cancel)
         return rows, tried
 
-    def _exchange(self, rows: IntArray, problem: ChoiceProblem, cancel: Callable[[], bool]) -> int:
+    def _exchange(self, rows: IntArray, every: list[ChoiceProblem], cancel: Callable[[], bool]) -> int:
         """Exchange ``rows`` in place until that pays no more; returns the number of exchanges tried."""
-        log_value, tried = _mean_log_value(problem, rows), 1
+        chosen = [_Chosen(p, self.shared, rows) for p in every]
+        log_value, tried = float(np.mean([log_values_of(c.problem, c.matrix[None])[0] for c in chosen])), 1
         for _ in range(MOST_PASSES):
-            improved, gains = False, self._seen(rows)
-            for position in range(problem.size):
+            improved, gains = False, self._seen(chosen[0])
+            for position in range(self.problem.size):
                 if cancel():
                     return tried
-                shortlist = self._best(gains.copy(), rows)
-                others = np.delete(rows, position)
-                every = (problem, *problem.beside)
-                trial = np.mean([_with_one_more(p, others, shortlist) for p in every], axis=0)
+                shortlist = self._best(gains, rows)
+                if not len(shortlist):
+                    continue
+                trial = np.mean([c.with_one_more(shortlist, position) for c in chosen], axis=0)
                 tried += len(shortlist)
-                best = int(np.argmax(trial)) if len(trial) else 0
-                if len(trial) and trial[best] > log_value + 1e-6:
+                best = int(np.argmax(trial))
+                if trial[best] > log_value + 1e-6:
                     rows[position], log_value, improved = shortlist[best], float(trial[best]), True
+                    self.shared.put(position, rows[position])
+                    chosen = [_Chosen(p, self.shared, rows) for p in every]
             if not improved:
                 break
         return tried
 
     def _greedy(self, start: IntArray) -> IntArray:
         """Fill up with the candidate of largest first-order gain, from a little of the candidates' mean."""
-        chosen, ground = list(start), 1e-3 * self.problem.size * self.average
-        while len(chosen) < self.problem.size:
-            taken = np.array(chosen, np.int64)
-            added = self.info.given(self.info.rows(taken))
-            matrix = ground + _information(self.problem, taken)
-            gradient = self.problem.criterion.value_and_gradient(matrix[None])[1][0]
-            chosen.append(int(self._best(np.sum((added @ gradient) * added, axis=(1, 2)), taken)[0]))
-        return np.array(chosen, np.int64)
+        rows, ground = np.array(start, np.int64), 1e-3 * self.problem.size * self.average
+        for position, row in enumerate(rows):
+            self.shared.put(position, row)
+        while len(rows) < self.problem.size:
+            chosen = _Chosen(self.problem, self.shared, rows)
+            row = int(self._best(self._gains(chosen, chosen.matrix + ground, given=True), rows)[0])
+            self.shared.put(len(rows), row)
+            rows = np.append(rows, row)
+        return rows
 
-    def _seen(self, rows: IntArray) -> FloatArray:
+    def _seen(self, chosen: _Chosen) -> FloatArray:
         """(C,) the sensitivity of every candidate seen from the rows chosen."""
-        info = self.info.rows(rows)
-        seen, _ = info.seen_from(np.ones(len(rows)))
-        matrix = _information(self.problem, rows) + 1e-6 * self.problem.size * self.average
+        return self._gains(chosen, chosen.matrix + 1e-6 * self.problem.size * self.average, given=False)
+
+    def _gains(self, chosen: _Chosen, matrix: FloatArray, *, given: bool) -> FloatArray:
+        """(C,) tr(G I_j): of what j adds to the rows chosen (``given``), or of the sensitivity seen from them."""
+        shared, m = self.shared, chosen.size
+        root = self._root(matrix)
+        cross = shared.cross[:, :, :m].reshape(shared.count * shared.r, -1)
+        flat = shared.columns.reshape(shared.count * shared.r, -1)
+        left = (flat @ root - cross @ (chosen.solved @ root)).reshape(shared.count, shared.r, -1)
+        if not given:
+            return np.asarray(np.sum((shared.whitener @ left) ** 2, axis=(1, 2)))
+        blocks = cross.reshape(shared.count, shared.r, -1)
+        met = (cross @ chosen.inverse).reshape(blocks.shape) @ np.swapaxes(blocks, 1, 2)
+        alone = shared.points + shared.visits + shared.own - met
+        return np.asarray(np.sum(left * (np.linalg.inv(alone) @ left), axis=(1, 2)))
+
+    def _root(self, matrix: FloatArray) -> FloatArray:
+        """(p, k) B with B Bᵀ the gradient at ``matrix`` (p, p), or its largest directions."""
+        if self.root is not None:
+            return np.asarray(np.linalg.solve(matrix, self.root))
         gradient = self.problem.criterion.value_and_gradient(matrix[None])[1][0]
-        every = self.info.as_seen_by(seen.model).whitened
-        return np.asarray(np.sum((every @ gradient) * every, axis=(1, 2)))
+        values, vectors = np.linalg.eigh(gradient)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
     def _best(self, gains: FloatArray, taken: IntArray) -> IntArray:
         """Candidates of largest gain, largest first; not those taken where each may be used once."""
@@ -466,23 +605,3 @@ class _Together:
             gains[taken] = -np.inf
         order = np.argsort(-gains, kind="stable")[:SHORTLIST]
         return order[np.isfinite(gains[order])]
-
-
-def _with_one_more(problem: ChoiceProblem, others: IntArray, new: IntArray) -> FloatArray:
-    """log Ψ of the rows ``others`` with each of ``new`` (K,): (K,).
-
-    For accuracies 1/tr(A M⁻¹) by Woodbury's identity, U being what a row adds and C the inverse without it:
-    tr A (C⁻¹ + UᵀU)⁻¹ = tr A C − tr (I + U C Uᵀ)⁻¹ U C A C Uᵀ.
-    """
-    assert problem.together is not None
-    added = problem.together.rows(new).given(problem.together.rows(others))
-    matrix = _information(problem, others)
-    if not isinstance(problem.criterion, Accuracy):
-        return log_values_of(problem, matrix + np.swapaxes(added, 1, 2) @ added)
-    inverse = np.linalg.inv(matrix + 1e-13 * np.diag(np.diag(matrix)))
-    half = inverse @ problem.criterion.weight
-    turned = np.swapaxes(added, 1, 2)
-    inner = np.eye(added.shape[1]) + added @ inverse @ turned
-    gained = np.linalg.solve(inner, added @ (half @ inverse) @ turned)
-    left = np.trace(half) - np.einsum("kii->k", gained)
-    return np.where(left > 0.0, -np.log(np.maximum(left, 1e-300)), -np.inf)

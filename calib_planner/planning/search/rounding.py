@@ -38,7 +38,7 @@ QUICK = 0.05
 """Seconds that all splits among the heaviest places may take: so many places are looked at."""
 
 
-def rounded(problem: ChoiceProblem, places: IntArray, rng: np.random.Generator) -> list[IntArray]:
+def rounded_rows(problem: ChoiceProblem, places: IntArray, rng: np.random.Generator) -> list[IntArray]:
     """Row numbers (size,) of whole-number plans: by exchange, and the best split among the first of ``places``.
 
     Args:
