@@ -293,7 +293,11 @@ def _search(
     clock: _Clock,
     executor: Executor | None,
 ) -> SearchResult:
-    """Parts of the work, here or by the executor, until enough is known; the best, the first one if equal."""
+    """Parts of the work, here or by the executor, until enough is known; the best, the first one if equal.
+
+    With a whole error model the rounded design comes first, since descents from it nearly always end higher than
+    others, and parts are added while they end higher still. Else it comes last, where the others are not enough.
+    """
     nobody = np.empty((0, len(space.robot.joint_names)))
 
     def searched(space: PlanSpace, criterion: Criterion) -> SearchProblem:
@@ -316,9 +320,15 @@ def _search(
     best: SearchResult | None = None
     done = evaluations = 0
     tops: list[float] = []
+    shared = isinstance(space.model, ExtendedModel) and bool(rounded.plans)
+    if shared:
+        best = improved(search, np.stack(rounded.plans), clock.over)
+        evaluations += best.evaluations
     futures = [executor.submit(search_chunk, *job) for job in work] if executor else []
     for index, job in enumerate(work):
         if index and (clock.over() or _agreed(tops) or _good_enough(space, design, best)):
+            break
+        if shared and tops and best is not None and best.log_value > tops[-1]:
             break
         result = futures[index].result() if futures else search_chunk(*job, clock.over)
         tops.append(result.log_value)
@@ -331,7 +341,7 @@ def _search(
     for future in futures:
         future.cancel()
     assert best is not None
-    if not clock.over() and (is_sharp(criterion) or not _good_enough(space, design, best)):
+    if not clock.over() and not shared and (is_sharp(criterion) or not _good_enough(space, design, best)):
         plans = [best.configurations, *rounded.plans]
         result = improved(search, np.stack(plans), clock.over)
         evaluations += result.evaluations
@@ -355,7 +365,7 @@ class _Rounded:
         if design is None or np.ndim(space.model.repetitions) or space.problem.candidates is not None:
             return []
         request = _choice(space, self.criterion, design.support, design)
-        request = replace(request, beside=tuple(_scaled_choices(space, self.criterion, request)), repeat=True)
+        request = replace(request, beside=tuple(_scaled_choices(space, self.criterion, request)))
         low, high = space.robot.joint_limits.T
         places = heaviest_places(design.support, design.weights, high - low)
         try:

@@ -527,8 +527,8 @@ class _Together:
         values, vectors = np.linalg.eigh(self.problem.criterion.weight / np.outer(units, units))
         largest = np.argsort(-values)
         share = np.cumsum(values[largest]) / values.sum()
-        kept = largest[: int(np.searchsorted(share, DIRECTIONS)) + 1]
-        return np.asarray(units[:, None] * vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)))
+        used = largest[: int(np.searchsorted(share, DIRECTIONS)) + 1]
+        return np.asarray(units[:, None] * vectors[:, used] * np.sqrt(np.maximum(values[used], 0.0)))
 
     def run(self, start: IntArray, cancel: Callable[[], bool]) -> tuple[IntArray, int]:
         rows = self._greedy(start)

@@ -46,9 +46,10 @@ def rounded_rows(problem: ChoiceProblem, places: IntArray, rng: np.random.Genera
         places: (K,) some of them, the heaviest first.
         rng: Of the exchange.
     """
-    sharp = replace(problem, criterion=sharpened(problem.criterion, STEPS[-1]), repeat=True)
+    shared = problem.together is not None  # equal configurations repeat their error
+    sharp = replace(problem, criterion=sharpened(problem.criterion, STEPS[-1]), repeat=not shared)
     plans = [choose(sharp, rng).rows]
-    if problem.together is not None:
+    if shared:
         return plans
     for count in range(min(len(places), 12), 0, -1):
         few = replace(sharp, rows=problem.rows[places[:count]], weights=np.empty(0))
