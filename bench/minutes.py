@@ -7,8 +7,8 @@ estimator identifies from the visits, and the mean error at configurations that 
 spread over all joint limits, as are the test poses of the plan; with ``--share`` both are where the robot works:
 in a box of that share of every joint's range, whose middle is drawn. Random visits are spread over all joint
 limits and, with ``--share``, over the box as well: the better of the two counts. A simulated robot errs as the
-typical error model says, each seed another one; the plan knows nothing of the seed. Random visits are the first n
-of one random sequence per seed. For every n the median over the seeds of the quotient random/planned is taken; the
+typical error model says, each seed another one; the plan knows nothing of the seed. Random visits are the first
+n of one random sequence. For every n the median over the seeds of the quotient random/planned is taken; the
 number of random visits that are as good as the planned ones is where that median is 1, by linear interpolation of
 its logarithm between the two n around the last crossing. ``>`` says that even the largest n is not enough.
 

@@ -86,7 +86,7 @@ def answer(
 def _planned(
     problem: PlanProblem, request: Any, settings: PlannerParameters, model: Model, callback: Callback | None
 ) -> Plan:
-    """The plan of as many configurations as are asked for, or for the time that the node's parameters give."""
+    """The plan of as many configurations as the request wants, or for the time of the node's parameters."""
     if settings.time_budget == 0 or int(request.configurations):
         return plan(problem, callback)
     return plan_for_time(problem, plan_pace(settings, model), settings.time_budget, callback=callback).plan
