@@ -79,7 +79,8 @@ class Terminal:
             timer.cancel()
             if timer.is_alive():
                 timer.join()
-            bar.stop()
+            if bar.live.is_started:  # it would end with an empty line all the same
+                bar.stop()
 
     @contextmanager
     def working(self, label: str) -> Iterator[None]:
