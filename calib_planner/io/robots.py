@@ -57,6 +57,7 @@ from calib_planner.robot import (
     check_joint_names,
     dh_elements,
     dh_levels,
+    limit_remarks,
     parse_coupling,
     pose_elements,
     pose_of,
@@ -172,11 +173,12 @@ def _robot(top: Node) -> Robot:
         if joint.get("unit", next(iter(valid))).value not in valid:
             kind = "turns" if turns else "slides"
             raise joint["unit"].refused(f"one of: {', '.join(valid)}, as the joint {kind}")
+    said: list[tuple[str, str]] = []
     for row, name in enumerate(names):
         low, high, remark = believable_limits(name, *limits[row].tolist(), turns=robot.joint_is_revolute[row])
         limits[row] = low, high
-        remarks += [remark] * bool(remark)
-    robot = replace(robot, joint_limits=limits, remarks=tuple(remarks))
+        said.append((name, remark))
+    robot = replace(robot, joint_limits=limits, remarks=(*remarks, *limit_remarks(said)))
     if "couple" not in top:
         return robot
     texts = [node.name() for node in top["couple"].items()]

@@ -28,7 +28,7 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.robot import believable_limits, rotation
+from calib_planner.robot import believable_limits, limit_remarks, rotation
 from calib_planner.units import brief, listed
 
 MOVING = ("revolute", "continuous", "prismatic")
@@ -164,7 +164,7 @@ class UrdfJoint:
 
     @property
     def remark(self) -> str:
-        """What is odd about its limits, a sentence; may be empty."""
+        """What is to be said of its limits, for ``limit_remarks``; may be empty."""
         return self._range[2]
 
     def error(self, part: str, got: object, expected: str, advice: str = "") -> FileFormatError:
@@ -266,7 +266,7 @@ def chain_of(
         joint.check_usable()
     if not any(j.moves for j in chain):
         raise FileFormatError(source, f"chain from {top!r} to {tip_link!r}", "no moving joint", "at least one")
-    remarks = [remark, *(j.remark for j in chain if j.moves)]
+    remarks = [remark, *limit_remarks((j.name, j.remark) for j in chain if j.moves)]
     return UrdfChain(
         joints=tuple(chain),
         base=top,

@@ -14,9 +14,12 @@ those that turn further have limits of whole half turns in radians, which stay.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from calib_planner.errors import InputError
+from calib_planner.units import listed
 
 MOST_TURN = 4.0 * np.pi
 """No joint's own limit is further than this from zero, two turns, unless it is of whole half turns [rad]."""
@@ -37,7 +40,8 @@ def believable_limits(name: str, low: float, high: float, *, turns: bool) -> tup
         turns: Whether the joint turns.
 
     Returns:
-        Lower and upper limit [rad | m], and a sentence, empty if the limits stay as they are.
+        Lower and upper limit [rad | m], and what is to be said of them, for ``limit_remarks``; empty if they stay
+        as they are.
 
     Raises:
         InputError: A sliding joint whose limits cannot be metres.
@@ -50,10 +54,19 @@ def believable_limits(name: str, low: float, high: float, *, turns: bool) -> tup
         return low, high, ""
     if far <= MOST_TURN or _half_turns(low, high):
         return low, high, ""
-    stated = f"limits of {name} are {low:g} and {high:g} rad"
+    stated = f"{low:g} and {high:g} rad"
     if far <= MOST_DEGREES:
         return float(np.deg2rad(low)), float(np.deg2rad(high)), f"{stated}: they are read as degrees"
-    return -np.pi, np.pi, f"{stated}: {name} is treated as continuous, from -180 to 180 degrees"
+    return -np.pi, np.pi, f"{stated}: treated as continuous, from -180 to 180 degrees"
+
+
+def limit_remarks(said: Iterable[tuple[str, str]]) -> list[str]:
+    """Sentences from pairs of a joint's name and what ``believable_limits`` says; those alike in one."""
+    alike: dict[str, list[str]] = {}
+    for name, text in said:
+        if text:
+            alike.setdefault(text, []).append(name)
+    return [f"limits of {listed(names)} are {text}" for text, names in alike.items()]
 
 
 def _half_turns(low: float, high: float) -> bool:

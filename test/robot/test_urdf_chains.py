@@ -188,7 +188,12 @@ def test_what_stands_beside_the_chain_does_not_matter(oddity):
 @pytest.mark.parametrize(
     ("low", "high", "limits", "word"),
     [
-        ("-1e16", "1e16", (-180, 180), "j1 is treated as continuous, from -180 to 180 degrees"),
+        (
+            "-1e16",
+            "1e16",
+            (-180, 180),
+            "limits of j1 are -1e+16 and 1e+16 rad: treated as continuous, from -180 to 180 degrees",
+        ),
         ("-999999", "999999", (-180, 180), "treated as continuous"),
         ("-180", "180", (-180, 180), "they are read as degrees"),
         ("-120", "60", (-120, 60), "limits of j1 are -120 and 60 rad: they are read as degrees"),
@@ -200,6 +205,13 @@ def test_absurd_limits_are_named(low, high, limits, word):
     robot = read(limited(f'<limit lower="{low}" upper="{high}"/>'))
     np.testing.assert_allclose(np.rad2deg(robot.joint_limits[0]), limits, atol=1e-3)
     assert [word in remark for remark in robot.remarks] == [True] * bool(word)
+
+
+def test_joints_with_the_same_absurd_limits_are_named_together():
+    wide = LIMIT.replace("-1", "-1e9").replace('"1"', '"1e9"', 1)
+    arm = (joint("j1", "a", "b", inside=wide), joint("j2", "b", "c"), joint("j3", "c", "d", inside=wide))
+    (remark,) = read(robot_of(*arm)).remarks
+    assert remark.startswith("limits of j1, j3 are -1e+09 and 1e+09 rad: treated as continuous")
 
 
 # ── with what numbers ────────────────────────────────────────────────────────────────────────────────
