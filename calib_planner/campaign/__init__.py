@@ -3,6 +3,7 @@
 docs/glossary.md explains the words.
 """
 
+from calib_planner.campaign.assess import identification_problem
 from calib_planner.campaign.decide import decide
 from calib_planner.campaign.finish import RULES
 from calib_planner.campaign.problem import OUTCOMES, CampaignProblem, CampaignResult, Exclusion, Round

@@ -24,6 +24,7 @@ from calib_planner.campaign import (
     Round,
     decide,
     from_measurements,
+    identification_problem,
 )
 from calib_planner.cli.arguments import (
     Commands,
@@ -169,7 +170,7 @@ def _by_hand(args: argparse.Namespace, problem: CampaignProblem, terminal: Termi
             state = state.decided(decide(state))
     action = state.action
     if isinstance(action, Finished):
-        _answer(args, terminal, action.result, {})
+        _answer(args, problem, terminal, action.result, {})
         return
     numbers = list(dict.fromkeys(state.queue))
     q = np.array([state.configurations[i].q for i in numbers])
@@ -227,12 +228,18 @@ def _simulated(args: argparse.Namespace, problem: CampaignProblem, terminal: Ter
     more: dict[str, Any] = {"seed": args.seed, "simulate": args.simulate, "true": errors}
     if result.estimate is not None:
         more["achieved_per_test_pose"] = world.errors(result.estimate.positions, problem.test_pose_array)
-    _answer(args, terminal, result, more)
+    _answer(args, problem, terminal, result, more)
 
 
-def _answer(args: argparse.Namespace, terminal: Terminal, result: CampaignResult, more: dict[str, Any]) -> None:
+def _answer(
+    args: argparse.Namespace,
+    problem: CampaignProblem,
+    terminal: Terminal,
+    result: CampaignResult,
+    more: dict[str, Any],
+) -> None:
     if args.output:
-        _write(make_folder(args.output, "--output"), result)
+        _write(make_folder(args.output, "--output"), problem, result)
     achieved = more.get("achieved_per_test_pose")
     answer = result.to_dict() | plain(more) | {"output": args.output}
     terminal.answer(answer, partial(show_result, result, achieved))
@@ -240,13 +247,14 @@ def _answer(args: argparse.Namespace, terminal: Terminal, result: CampaignResult
         terminal.note(f"Measurements and estimate are in {args.output}")
 
 
-def _write(folder: Path, result: CampaignResult) -> None:
+def _write(folder: Path, problem: CampaignProblem, result: CampaignResult) -> None:
     if result.fit is not None:
         write_measurements(folder / "measurements.csv", result.fit, "--output")
     if result.validation is not None:
         write_measurements(folder / "validation.csv", result.validation, "--output")
-    if result.estimate is not None:
-        write_estimate(folder / "estimate.yaml", result.estimate, "--output")
+    if result.estimate is not None and result.fit is not None:
+        whole = identification_problem(problem, result.fit)
+        write_estimate(folder / "estimate.yaml", result.estimate, "--output", whole)
 
 
 # ── a campaign for people: its verdict and outcome first, then how it went ─────────────────────────────────

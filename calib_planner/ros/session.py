@@ -424,7 +424,7 @@ def save(folder: str, session: Session, how: Matching, urdf: str = "") -> list[P
     estimate = session.settle(how)
     if isinstance(estimate, Estimate):
         paths.append(confined(folder, f"estimate_{name}.yaml"))
-        write_estimate(paths[-1], estimate, FIELD)
+        write_estimate(paths[-1], estimate, FIELD, session.problem(how))
         if urdf:
             paths.append(confined(folder, f"calibrated_{name}.urdf"))
             write_text(paths[-1], calibrated_urdf(urdf, estimate.calibrated)[0], FIELD)

@@ -123,6 +123,17 @@ def test_the_estimate_comes_back_whole(saved: SavedEstimate) -> None:
     assert np.isfinite(estimate.residuals.spare)
 
 
+def test_a_campaign_leaves_an_estimate_that_can_be_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = "campaign --robot planar_2r --test-pose 0.3,0.8 --required-accuracy 2mm --budget 16 --validation 4"
+    found = run(f"{words} --simulate 1 --starts 1 --output {tmp_path}", capsys)
+    assert found["verdict"]["level"] in ("PASS", "WARN", "FAIL")
+    run(f"export {tmp_path}/estimate.yaml --report {tmp_path}/r.html", capsys)
+    told = report_data(tmp_path / "r.html")["estimate"]
+    assert told["validation"]["count"] == 4 and told["used"] > 4
+
+
 def test_coupled_joints_come_back(saved: SavedEstimate) -> None:
     robot = replace(saved, couple=("nod+=spin",)).nominal_robot()
     assert [str(one) for one in robot.couplings] == ["nod+=spin"] and not saved.nominal_robot().couplings
