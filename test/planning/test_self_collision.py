@@ -104,7 +104,7 @@ def test_plans_avoid_collisions(arm):
 
 
 def test_no_collision_is_missed_after_a_deep_one(tmp_path):
-    """Coal begins where it ended for the last configuration, unless told not to, and then missed the 342nd of these.
+    """Coal begins where it ended for the last configuration, unless told not to: the 342nd of these was missed.
     Distances, which do not remember, are the oracle."""
     robot = Robot.load("kuka_kr270")
     path = tmp_path / "cylinders.urdf"
