@@ -37,6 +37,7 @@ what the best whole-number plan at the configurations of the measure reaches.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,6 +48,7 @@ from calib_planner.planning.criteria import Criterion, is_sharp, sharpened
 from calib_planner.planning.extended import ExtendedModel, LinearisedExtension
 from calib_planner.planning.feasibility import Feasibility, PlanWalls
 from calib_planner.planning.information import Model
+from calib_planner.planning.parallel import cut, results_of
 from calib_planner.planning.search.descent import Descent, climb, descend
 from calib_planner.planning.search.interior import descend_inside
 
@@ -112,6 +114,7 @@ def approximate_design(
     start: FloatArray,
     rng: np.random.Generator,
     cancel: Callable[[], bool] = lambda: False,
+    executor: Executor | None = None,
     *,
     rounds: int = 60,
     gap: float = 3e-3,
@@ -123,17 +126,18 @@ def approximate_design(
         start: (K, joints) configurations to begin with, beside random ones [rad | m].
         rng: Of the random configurations.
         cancel: Called after every round; ``True`` ends the work with what there is.
+        executor: Any ``concurrent.futures`` executor, for what is to be known of every candidate.
         rounds: Most rounds.
         gap: Relative.
     """
     if isinstance(problem.model, ExtendedModel):
-        return _extended_design(problem, problem.model, start, rng, cancel)
+        return _extended_design(problem, problem.model, start, rng, cancel, executor)
     if problem.candidates is None:
         return _grown(problem, *_first_measure(problem, start, rng), rng, cancel, rounds=rounds, gap=gap)
     q = problem.candidates[problem.feasibility.mask(problem.candidates)]
     if not len(q):
         raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
-    rows = problem.model.whitened(q)
+    rows = np.concatenate(results_of(executor, _whitened, [(problem.model, part) for part in cut(q)]))
     distinct = problem.visits if problem.distinct else None
     design = candidate_design(rows, problem.criterion, problem.prior, problem.visits, distinct, cancel)
     return replace(design, support=q, seen=problem.model)
@@ -427,12 +431,18 @@ def _heights(model: Model, gradient: FloatArray, q: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nab,ab->n", model.at(q), gradient))
 
 
+def _whitened(model: Model, q: FloatArray) -> FloatArray:
+    """(N, 3·targets, p) rows of one visit to each of ``q`` (N, joints)."""
+    return model.whitened(q)
+
+
 def _extended_design(
     problem: DesignProblem,
     model: ExtendedModel,
     start: FloatArray,
     rng: np.random.Generator,
     cancel: Callable[[], bool],
+    executor: Executor | None,
 ) -> ApproximateDesign:
     """The same as ``approximate_design`` with (2) of ``extended``: heights are those of the model seen from the
     design, and M₀ has Σ_l Θ_lᵀΘ_l beside it."""
@@ -467,7 +477,8 @@ def _extended_design(
         )
         lifted = replace(problem, model=seen.model)
         if candidates is not None:
-            where, heights = candidates, _heights(seen.model, gradient, candidates)
+            jobs = [(seen.model, gradient, part) for part in cut(candidates)]
+            where, heights = candidates, np.concatenate(results_of(executor, _heights, jobs))
         else:
             peaks = maximise_sensitivity(lifted, gradient, _probes(lifted, gradient, support, weights, rng))
             where, heights = peaks.x, np.exp(-peaks.value)

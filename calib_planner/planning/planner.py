@@ -1,8 +1,9 @@
 """The verb: ``plan(problem)`` → ``Plan``. Prepare, bound, search, prove what was reached.
 
 The approximate design comes first: it gives the bound, and its support is where good plans are. Then the
-search, in independent parts that any ``concurrent.futures`` executor may do. Compound criteria are
-geometric means of efficiencies, so their parts' approximate designs are computed before them.
+search, in independent parts that any ``concurrent.futures`` executor may do, as it may do what the design has to
+know of every candidate. Compound criteria are geometric means of efficiencies, so their parts' approximate
+designs are computed before them.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def plan(
     *seeds, own = np.random.SeedSequence(problem.search.seed).spawn(len(parts(problem.starts)) + 1)
     criterion, target = _criteria(space, np.random.default_rng(own))
     rng = np.random.default_rng(own)
-    design = _approximate(space, target, rng, clock.over) if target.concave else None
+    design = _approximate(space, target, rng, clock.over, executor) if target.concave else None
     proof = None
     if design is not None:
         design, proof = _proven(space, target, design, np.random.default_rng(own.spawn(1)[0]), clock, prove)
@@ -236,11 +237,15 @@ def _criteria(space: PlanSpace, rng: np.random.Generator) -> tuple[Criterion, Cr
 
 
 def _approximate(
-    space: PlanSpace, criterion: Criterion, rng: np.random.Generator, cancel: Callable[[], bool]
+    space: PlanSpace,
+    criterion: Criterion,
+    rng: np.random.Generator,
+    cancel: Callable[[], bool],
+    executor: Executor | None = None,
 ) -> ApproximateDesign:
     tests = space.problem.test_pose_array
     usable = tests[space.feasibility.mask(tests)] if space.problem.candidates is None else tests[:0]
-    return approximate_design(_design_problem(space, criterion), usable, rng, cancel)
+    return approximate_design(_design_problem(space, criterion), usable, rng, cancel, executor)
 
 
 def _design_problem(space: PlanSpace, criterion: Criterion) -> DesignProblem:

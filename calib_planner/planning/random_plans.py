@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray, check_count, plain
 from calib_planner.errors import InputError
 from calib_planner.planning.information import InformationModel, PlanSpace, plan_space
+from calib_planner.planning.parallel import results_of
 from calib_planner.planning.planner import plan
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import Plan
@@ -49,8 +51,16 @@ class Comparison:
         )
 
 
-def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> list[Comparison]:
+def compare(
+    problem: PlanProblem, sizes: list[tuple[int, int]], count: int, executor: Executor | None = None
+) -> list[Comparison]:
     """A column per (configurations, repetitions).
+
+    Args:
+        problem: The request; its sizes are not looked at.
+        sizes: Configurations and repetitions of each column.
+        count: Number of random plans.
+        executor: Any ``concurrent.futures`` executor; the figures are the same whichever, or without one.
 
     Raises:
         InputError: Another criterion than ``test_pose``.
@@ -61,20 +71,30 @@ def compare(problem: PlanProblem, sizes: list[tuple[int, int]], count: int) -> l
     columns = []
     for k, r in sizes:
         request = replace(problem, configurations=k, repetitions=r)
-        random = random_accuracies(plan_space(request), count, np.random.default_rng([problem.search.seed, k, r]))
-        columns.append(Comparison(str(k) if r == 1 else f"{k}x{r}", plan(request), random))
+        rng = np.random.default_rng([problem.search.seed, k, r])
+        random = random_accuracies(plan_space(request), count, rng, executor)
+        columns.append(Comparison(str(k) if r == 1 else f"{k}x{r}", plan(request, executor=executor), random))
     return columns
 
 
-def random_accuracies(space: PlanSpace, count: int, rng: np.random.Generator) -> FloatArray:
-    """(count,) ρ0 [m] of random feasible plans of the problem's size; huge where nearly singular."""
+def random_accuracies(
+    space: PlanSpace, count: int, rng: np.random.Generator, executor: Executor | None = None
+) -> FloatArray:
+    """(count,) ρ0 [m] of random feasible plans of the problem's size; huge where nearly singular.
+
+    The batches have seeds of their own, drawn from ``rng``, and any ``concurrent.futures`` executor may do them.
+    """
     size = space.problem.configurations
-    criterion = space.criterion("test_pose")
     batch = max((BATCH if isinstance(space.model, InformationModel) else BATCH // 10) // size, 1)
-    values = []
-    for first in range(0, count, batch):
-        plans = min(batch, count - first)
-        matrices = space.model.totals(space.feasibility.sample(rng, plans * size), size) + space.prior
-        psi = criterion.value_and_gradient(matrices)[0]
-        values.append(np.where(psi > 0, np.maximum(psi, 1e-300) ** -0.5, np.inf))
-    return np.concatenate(values)
+    plans = [min(batch, count - first) for first in range(0, count, batch)]
+    seeds = rng.integers(0, 2**63, len(plans)).tolist()
+    jobs = ((space, many, seed) for many, seed in zip(plans, seeds, strict=True))
+    return np.concatenate(results_of(executor, _accuracies, jobs))
+
+
+def _accuracies(space: PlanSpace, count: int, seed: int) -> FloatArray:
+    """(count,) ρ0 [m] of one batch."""
+    size = space.problem.configurations
+    q = space.feasibility.sample(np.random.default_rng(seed), count * size)
+    psi = space.criterion("test_pose").value_and_gradient(space.model.totals(q, size) + space.prior)[0]
+    return np.where(psi > 0, np.maximum(psi, 1e-300) ** -0.5, np.inf)

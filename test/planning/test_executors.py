@@ -14,8 +14,12 @@ import pytest
 from robots import CASES, mixed
 
 from calib_planner import Plan, PlanProblem, Robot, plan
-from calib_planner.planning import Search
+from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ErrorModel, typical
+from calib_planner.planning import Candidates, Search, compare
+from calib_planner.planning.parallel import PART
 from calib_planner.planning.search.multistart import CHUNKS, parts
+from calib_planner.tracker import Isotropic
 
 
 def problem() -> PlanProblem:
@@ -50,19 +54,38 @@ def cluster(folder: Path) -> Iterator[Executor]:
         yield client.get_executor()
 
 
+def among(model: ErrorModel | None) -> PlanProblem:
+    """Of more candidates than one part of the work holds, so that there are two."""
+    robot = Robot.load("planar_2r")
+    rows = np.random.default_rng(7).uniform(*robot.joint_limits.T, (PART + 60, 2))
+    return PlanProblem(robot, [0.2, 0.9], 4, candidates=Candidates(rows), error_model=model)
+
+
+def everything(executor: Executor | None) -> tuple[list[Plan], FloatArray]:
+    """Plans of free configurations, among candidates by either model, and random baselines in several batches."""
+    requests = [problem(), among(None), among(typical(Isotropic(3e-5)))]
+    column = compare(problem(), [(4, 1)], 12_000, executor)[0]
+    return [*(plan(p, executor=executor) for p in requests), column.proposed], column.random
+
+
 @pytest.fixture(scope="module")
-def alone() -> Plan:
-    return plan(problem())
+def alone() -> tuple[list[Plan], FloatArray]:
+    return everything(None)
 
 
 @pytest.mark.parametrize("workers", [threads, processes, cluster])
 def test_same_seed_same_plan_whatever_the_executor(workers, alone, tmp_path):
     with workers(tmp_path) as executor:
-        found = plan(problem(), executor=executor)
-    np.testing.assert_array_equal(found.configurations, alone.configurations)
-    assert found.quality.predicted_accuracy == alone.quality.predicted_accuracy
-    assert found.quality.lower_bound == alone.quality.lower_bound
-    assert (found.quality.starts, found.quality.evaluations) == (alone.quality.starts, alone.quality.evaluations)
+        plans, random = everything(executor)
+    for found, known in zip(plans, alone[0], strict=True):
+        np.testing.assert_array_equal(found.configurations, known.configurations)
+        assert found.quality.predicted_accuracy == known.quality.predicted_accuracy
+        assert found.quality.lower_bound == known.quality.lower_bound
+        assert (found.quality.starts, found.quality.evaluations) == (
+            known.quality.starts,
+            known.quality.evaluations,
+        )
+    np.testing.assert_array_equal(random, alone[1])
 
 
 class Backwards(Executor):
@@ -86,8 +109,10 @@ class Backwards(Executor):
 
 
 def test_order_of_completion_does_not_matter(alone):
-    found = plan(problem(), executor=Backwards())
-    np.testing.assert_array_equal(found.configurations, alone.configurations)
+    plans, random = everything(Backwards())
+    for found, known in zip(plans, alone[0], strict=True):
+        np.testing.assert_array_equal(found.configurations, known.configurations)
+    np.testing.assert_array_equal(random, alone[1])
 
 
 def test_cancelling_with_an_executor_returns_a_valid_plan():
