@@ -205,6 +205,11 @@ class _OneThread:
 ONE_THREAD = _OneThread()
 
 
+def one_thread_here() -> None:
+    """From now on linear algebra in this process is done by the thread that calls it."""
+    ONE_THREAD.__enter__()
+
+
 def one_thread(function: F) -> F:
     """Decorator: linear algebra in ``function`` is done by the thread that calls it."""
 

@@ -14,9 +14,9 @@ from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
 from calib_planner.io import Reading, angle_factors, read_configurations
-from calib_planner.robot import Coupling, Robot, parse_coupling
+from calib_planner.robot import Coupling, Robot, check_reflectors, parse_coupling
 from calib_planner.tracker import Isotropic
-from calib_planner.units import UNSAID, Units, quantity
+from calib_planner.units import UNSAID, Units, length, quantity
 
 if TYPE_CHECKING:
     from calib_planner.planning import Pace
@@ -30,6 +30,9 @@ ERROR_MODEL = "typical"
 KNOWN = "none"
 """Value of --unknown for a base and targets that are as the robot and --targets say."""
 SIGMA = 3e-5
+COARSE = 5e-3
+"""An instrument that errs by more [m] is told: robots err less before they are calibrated. It is no error, since
+plans are the same whatever the scale of σ."""
 """Standard deviation of one coordinate of a laser tracker, where nothing else is said [m]."""
 
 
@@ -244,7 +247,10 @@ def load_robot(args: argparse.Namespace) -> Robot:
         Terminal(json_wanted=args.json).note(f"{args.robot}: {remark}")
     if args.couple:
         robot = robot.with_couplings(args.couple, "--couple")
-    return robot if args.targets is None else robot.with_targets(rows("--targets", args.targets, "xyz"))
+    if args.targets is not None:
+        robot = robot.with_targets(rows("--targets", args.targets, "xyz"))
+    check_reflectors(robot, "--robot" if args.targets is None else "--targets")
+    return robot
 
 
 def choose_parameters(robot: Robot, args: argparse.Namespace) -> Robot:
@@ -375,6 +381,10 @@ def conditions(args: argparse.Namespace, robot: Robot) -> dict[str, Any]:
     from calib_planner.io import read_constraints, read_instrument
 
     noise = Isotropic(args.sigma) if args.instrument is None else read_instrument(args.instrument)
+    if noise.typical > COARSE:
+        source = "--sigma" if args.instrument is None else args.instrument
+        said = f"{source}: {length(noise.typical)} in each coordinate is more than robots err by: millimetres?"
+        Terminal(json_wanted=args.json).note(said)
     if args.constraints is None:
         return {"noise": noise}
     return {"noise": noise, "constraints": read_constraints(args.constraints, robot)}

@@ -49,6 +49,7 @@ from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError
 from calib_planner.io import (
+    check_writable,
     make_folder,
     read_data,
     read_error_model,
@@ -141,6 +142,10 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError("--held-out", "without --measured", "--measured FILE beside it")
     if args.next is not None and not args.next.lower().endswith(".csv"):
         raise InputError("--next", repr(args.next), "a name that ends in .csv")
+    if args.next is not None:
+        check_writable(args.next, "--next")
+    if args.output is not None:
+        make_folder(args.output, "--output")
 
 
 def _problem(args: argparse.Namespace, robot: Robot) -> CampaignProblem:

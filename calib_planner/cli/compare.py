@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.table import Table
 
 from calib_planner.cli.arguments import Commands, add_command, option
-from calib_planner.cli.plan import add_problem, make_problem
+from calib_planner.cli.plan import add_jobs, add_problem, make_problem
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
-from calib_planner.planning import Comparison, compare
+from calib_planner.planning import Comparison, compare, processes
 
 EXAMPLE = """calib-planner compare --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
       --configurations 3 4 12 --replicate 3x4 4x3 --random 20000"""
@@ -25,6 +25,7 @@ def add(commands: Commands, summary: str) -> None:
     option(work, "--configurations", "M", "numbers of configurations", kind=int, nargs="+")
     option(work, "--replicate", "KxR", "K configurations measured R times each", nargs="+")
     option(parser, "--random", "N", "number of random plans", 20_000)
+    add_jobs(parser)
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
@@ -32,8 +33,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
     if not sizes:
         raise InputError("--configurations", "none", "at least one number", "or give --replicate 3x4")
     problem = make_problem(args, sizes[0][0], sizes[0][1])
-    with terminal.working("comparing with random plans"):
-        columns = compare(problem, sizes, args.random)
+    with terminal.working("comparing with random plans"), processes(args.jobs, "--jobs") as executor:
+        columns = compare(problem, sizes, args.random, executor)
     result = {
         "robot": problem.robot.name,
         "sigma": problem.instrument.typical,

@@ -32,6 +32,7 @@ from calib_planner.io import (
     SavedEstimate,
     Understanding,
     calibrated_robot,
+    check_writable,
     format_table,
     in_units,
     read_estimate,
@@ -79,6 +80,8 @@ def add_correction(group: Group) -> None:
 
 
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
+    if args.output:
+        check_writable(args.output, "--output")
     saved = read_estimate(args.estimate)
     nominal = robot_of(args, saved)
     result, file = corrected(args, saved, nominal, args.joint_targets, terminal)

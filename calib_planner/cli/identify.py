@@ -50,6 +50,7 @@ from calib_planner.io import (
     BagTopics,
     Reading,
     Sources,
+    check_writable,
     is_bag,
     placement,
     read_instrument,
@@ -412,8 +413,7 @@ def check_outputs(args: argparse.Namespace, robot: Robot) -> None:
         place = user_path(path).resolve()
         if place in taken:
             raise InputError(flag, path, f"another file than {taken[place]}")
-        if not place.parent.is_dir():
-            raise InputError(flag, f"{path} (no such folder)", "a file in a folder that exists", "make it first")
+        check_writable(path, flag)
         taken[place] = flag
     if args.urdf_output:
         require_urdf(robot, "--urdf-output")

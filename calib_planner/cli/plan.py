@@ -43,6 +43,7 @@ from calib_planner.cli.terminal import Terminal, configurations_table
 from calib_planner.error_model import ACCURACIES, ErrorModel, Prior, typical_prior
 from calib_planner.errors import InputError
 from calib_planner.io import (
+    check_writable,
     make_folder,
     planned_error_model,
     read_configurations,
@@ -67,6 +68,7 @@ from calib_planner.planning import (
     plan_for_accuracy_in_time,
     plan_for_time,
     plan_sheet,
+    processes,
     split_budget,
     timetable,
 )
@@ -101,6 +103,7 @@ def add(commands: Commands, summary: str) -> None:
     option(size, "--accuracy", "A", text, kind=float)
     option(work, "--repetitions", "K", "number of measurements at each configuration (1)", kind=int)
     add_pace(parser)
+    add_jobs(parser)
     switch(parser, "--prove", "make the bound rigorous, by branch and bound")
     option(parser, "--output", "FILE", "write the plan: .yaml, or .csv for a table")
     option(parser, "--sheet", "DIR", "write the sheet for the person at the robot, see sheet")
@@ -128,7 +131,11 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             split = plan_for_accuracy(problem, args.accuracy, watch=watch)
         elif args.measurements is not None:
             split = split_budget(problem, args.measurements, watch=watch)
-        plan = split.plan if split else find_plan(problem, report, prove=args.prove)
+        if split:
+            plan = split.plan
+        else:
+            with processes(args.jobs, "--jobs") as executor:
+                plan = find_plan(problem, report, executor, prove=args.prove)
     if args.output:
         _write(args.output, plan)
     if args.sheet:
@@ -188,12 +195,21 @@ def _times(times: Timetable) -> dict[str, Any]:
 def _check(args: argparse.Namespace) -> None:
     if args.repetitions is not None and args.configurations is None:
         raise InputError("--repetitions", args.repetitions, "--configurations beside it")
-    if args.prove and args.configurations is None:
-        raise InputError("--prove", "without it", "--configurations beside it")
+    for flag, given in (("--prove", args.prove), ("--jobs", args.jobs != 1)):
+        if given and args.configurations is None:
+            raise InputError(flag, "without it", "--configurations beside it")
     if args.output and not args.output.lower().endswith((".yaml", ".yml", ".csv")):
         raise InputError("--output", repr(args.output), "a name that ends in .yaml or .csv")
     if args.sheet:
         make_folder(args.sheet, "--sheet")  # refused before the search, not after it
+    if args.output:
+        check_writable(args.output, "--output")
+
+
+def add_jobs(parser: argparse.ArgumentParser) -> None:
+    """--jobs, for what ``planning.parallel`` cuts in parts."""
+    text = "processes that work side by side; the result is the same. It pays for work of half a minute and more"
+    option(parser, "--jobs", "N", text, 1)
 
 
 def _write(output: str, plan: Plan) -> None:

@@ -28,7 +28,7 @@ from calib_planner.cli.gravity import add_gravity, error_model_of
 from calib_planner.cli.terminal import Terminal
 from calib_planner.error_model import to_mapping
 from calib_planner.errors import FileFormatError, InputError
-from calib_planner.io import measurements_text, read_plan, read_plan_csv, write_measurements
+from calib_planner.io import check_writable, measurements_text, read_plan, read_plan_csv, write_measurements
 from calib_planner.robot import Robot
 from calib_planner.simulation import (
     ANGLE_ERROR,
@@ -78,6 +78,8 @@ def assignment(text: str) -> tuple[str, float]:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     robot = choose_parameters(load_robot(args), args)
     configurations, repetitions = _plan(robot, args)
+    if args.output:
+        check_writable(args.output, "--output")
     check_count("--seed", args.seed, low=0, high=2**63 - 1)
     truth_seed, noise_seed = independent_seeds(args.seed, 2)
     if args.noise_seed is not None:

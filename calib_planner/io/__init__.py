@@ -81,7 +81,7 @@ if TYPE_CHECKING:
         open_store,
         stored_model,
     )
-    from calib_planner.io.text import fresh_folder, make_folder, read_text, user_path, write_text
+    from calib_planner.io.text import check_writable, fresh_folder, make_folder, read_text, user_path, write_text
     from calib_planner.io.understanding import BagTopics, JointTable, Reading, Source, Understanding
     from calib_planner.io.urdf import (
         calibrated_urdf,
@@ -115,7 +115,7 @@ else:
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
             "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "
             "open_campaign open_store stored_model",
-            "text": "fresh_folder make_folder read_text user_path write_text",
+            "text": "check_writable fresh_folder make_folder read_text user_path write_text",
             "understanding": "BagTopics JointTable Reading Source Understanding",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_chain read_speed_limits require_urdf "
             "write_calibrated_urdf",

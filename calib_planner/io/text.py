@@ -174,9 +174,33 @@ def write_text(path: str | Path, text: str, field: str = "output") -> None:
         else:
             _replace(target.resolve(), text)
     except OSError as error:
-        reason = f"{path} ({error.strerror or error})"
-        advice = "choose another path or make the folder first"
-        raise InputError(field, reason, "a file path that can be written", advice) from None
+        raise _unwritable(path, field, error) from None
+
+
+def check_writable(path: str | Path, field: str = "output") -> None:
+    """Find out before the work whether ``write_text`` will be able to write there; leaves nothing behind.
+
+    Raises:
+        InputError: The path cannot be written; names ``field``.
+    """
+    target = user_path(path).resolve()
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(21, "is a folder")
+        if target.exists() and not target.is_file():
+            return  # a device or a pipe
+        handle, name = tempfile.mkstemp(prefix=f".{target.name[:64]}.", dir=target.parent)
+        os.close(handle)
+        os.unlink(name)
+    except OSError as error:
+        raise _unwritable(path, field, error) from None
+
+
+def _unwritable(path: str | Path, field: str, error: OSError) -> InputError:
+    reason = f"{path} ({error.strerror or error})"
+    return InputError(
+        field, reason, "a file path that can be written", "choose another path or make the folder first"
+    )
 
 
 def _replace(target: Path, text: str) -> None:

@@ -30,6 +30,7 @@ from calib_planner.planning.information import (
     plan_space,
     smallest_size,
 )
+from calib_planner.planning.parallel import processes
 from calib_planner.planning.planner import Callback, Progress, judged, plan
 from calib_planner.planning.problem import (
     GENERAL_SHARE,

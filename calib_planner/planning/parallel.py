@@ -7,11 +7,13 @@ sends function and arguments by pickle: functions of a module, frozen values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, check_count, one_thread_here
 
 T = TypeVar("T")
 PART = 500
@@ -25,6 +27,16 @@ def results_of(executor: Executor | None, function: Callable[..., T], jobs: Iter
         return [function(*job) for job in jobs]
     futures = [executor.submit(function, *job) for job in jobs]
     return [future.result() for future in futures]
+
+
+@contextmanager
+def processes(count: int, field: str = "processes") -> Iterator[Executor | None]:
+    """An executor of so many processes on this machine, each with one thread; ``None`` for one."""
+    if check_count(field, count, high=1_000) == 1:
+        yield None
+        return
+    with ProcessPoolExecutor(count, get_context("spawn"), initializer=one_thread_here) as executor:
+        yield executor
 
 
 def cut(q: FloatArray) -> list[FloatArray]:

@@ -15,7 +15,7 @@ from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.measurements import Measurements
 from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA
 from calib_planner.planning.feasibility import Constraint
-from calib_planner.robot import Robot
+from calib_planner.robot import Robot, check_reflectors
 from calib_planner.tracker import Isotropic, Noise
 from calib_planner.units import Told
 
@@ -145,6 +145,7 @@ class PlanProblem(Told):
             raise InputError("robot", type(robot).__name__, "a Robot", "use Robot.load(...)")
         if not robot.parameter_names:
             raise InputError("robot", "no active parameters", "at least one", "use robot.with_parameters(...)")
+        check_reflectors(robot)
         if self.criterion not in CRITERIA:
             raise UnknownNameError("criterion", str(self.criterion), CRITERIA)
         if self.accuracy_frame not in ACCURACIES:

@@ -21,7 +21,7 @@ from calib_planner.robot.elements import (
 )
 from calib_planner.robot.identifiability import NO_LEVER, Identifiability, analyse, describe
 from calib_planner.robot.inverse import Goals, goals_of, residuals, solve
-from calib_planner.robot.limits import believable_limits, limit_remarks
+from calib_planner.robot.limits import believable_limits, check_reflectors, limit_remarks
 from calib_planner.robot.linearisation import Layout, Linearisation, Posture
 from calib_planner.robot.masses import LinkMass, lumped
 from calib_planner.robot.origins import (

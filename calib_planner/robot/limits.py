@@ -1,4 +1,4 @@
-"""Joint limits that cannot be meant as they stand, and what is made of them.
+"""Joint limits and reflectors that cannot be meant as they stand, and what is made of them.
 
 Descriptions of robots state limits in radians and metres. Three kinds of numbers are something else:
 
@@ -10,6 +10,9 @@ Descriptions of robots state limits in radians and metres. Three kinds of number
 
 Joints of arms turn by less than two turns either way (in 110 public URDFs of six and seven axes: by 1.25), and
 those that turn further have limits of whole half turns in radians, which stay.
+
+A reflector that is farther from the flange than the whole arm is long, and than a metre, is on no tool: its
+numbers are millimetres. That is an error and not a remark: everything computed with it would be wrong, silently.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from calib_planner.errors import InputError
+from calib_planner.robot.capsules import chain_length
+from calib_planner.robot.chain import Robot
 from calib_planner.units import listed
 
 MOST_TURN = 4.0 * np.pi
@@ -29,6 +34,8 @@ HALF_TURNS = 1e-3
 """A number this near to a whole number of half turns is one [half turns]."""
 MOST_SLIDE = 100.0
 """No joint slides further than this from its zero [m]."""
+LONGEST_TOOL = 1.0
+"""Any arm may carry a tool of this length [m]."""
 
 
 def believable_limits(name: str, low: float, high: float, *, turns: bool) -> tuple[float, float, str]:
@@ -67,6 +74,20 @@ def limit_remarks(said: Iterable[tuple[str, str]]) -> list[str]:
         if text:
             alike.setdefault(text, []).append(name)
     return [f"limits of {listed(names)} are {text}" for text, names in alike.items()]
+
+
+def check_reflectors(robot: Robot, field: str = "targets") -> None:
+    """Refuse reflectors that no tool can carry.
+
+    Raises:
+        InputError: Names the reflector, how far it is, and the unit that was probably meant.
+    """
+    most = max(chain_length(robot), LONGEST_TOOL)
+    for k, xyz in enumerate(robot.target_offsets, 1):
+        away = float(np.linalg.norm(xyz))
+        if away > most:
+            got = f"reflector {k} at {away:.3g} m from the flange"
+            raise InputError(field, got, f"metres, at most the arm's length of {most:.3g}", "millimetres?")
 
 
 def _half_turns(low: float, high: float) -> bool:

@@ -58,6 +58,17 @@ CASES = {
     "decimal comma": (f"{PLAN} 2 --test-pose 0,0 --sigma 0,3mm", 2, ["--sigma", "use a decimal point"]),
     "two sizes": (f"{PLAN} 2 --accuracy 1mm", 2, ["--accuracy", "one of the two", "--configurations"]),
     "unknown flag": (f"{PLAN} 2 --test-pose 0,0 --colour 3", 2, ["--colour"]),
+    "reflector in millimetres": (
+        f"{PLAN} 2 --test-pose 0,0 --targets 60,20,90",
+        2,
+        ["--targets", "110 m", "millimetres?"],
+    ),
+    "jobs for sizes": (
+        f"{PLAN[:-17]} --test-pose 0,0 --measurements 6 --jobs 2",
+        2,
+        ["--jobs", "--configurations"],
+    ),
+    "no jobs": (f"{PLAN} 2 --test-pose 0,0 --jobs 0", 2, ["--jobs", "from 1 to"]),
     "abbreviated flag": (f"{PLAN} 2 --test-po 0,0", 2, ["--test-po"]),
     "no robot": ("plan --configurations 2", 2, ["--robot"]),
     "no test pose": (f"{PLAN} 2", 2, ["--test-pose", "q1, q2", "--test-path"]),
@@ -268,3 +279,40 @@ def test_numbers_that_need_no_quotes(capsys: pytest.CaptureFixture[str]) -> None
 def test_bind_negative() -> None:
     assert bind_negative(["--a", "-1", "--b", "-.5,2", "-3"]) == ["--a=-1", "--b=-.5,2", "-3"]
     assert bind_negative(["--a=1", "-2", "-h"]) == ["--a=1", "-2", "-h"]
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (f"{PLAN} 2 --test-pose 0,0 --output nowhere/plan.yaml", "--output"),
+        (f"{PLAN} 2 --test-pose 0,0 --output folder.yaml", "--output"),
+        (f"{PLAN} 2 --test-pose 0,0 --sheet good.csv/sheet", "--sheet"),
+        (f"{SIMULATE} joints_only.csv --output nowhere/measured.csv", "--output"),
+        ("compensate --estimate good.csv --targets good.csv --output nowhere/x.csv", "--output"),
+        ("campaign --robot planar_2r --test-pose 0,0 --required-accuracy 1mm --next nowhere/next.csv", "--next"),
+        (
+            "campaign --robot planar_2r --test-pose 0,0 --required-accuracy 1mm --simulate 1 --output good.csv/x",
+            "--output",
+        ),
+    ],
+)
+def test_output_paths_are_looked_at_before_the_work(words, option, tmp_path, monkeypatch, capsys):
+    """The work itself is out of order, and nothing is left behind by looking."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "good.csv").write_text("kept")
+    (tmp_path / "joints_only.csv").write_text("q1,q2\n0,0\n1,1\n")
+    (tmp_path / "folder.yaml").mkdir()
+    before = sorted(p.name for p in tmp_path.iterdir())
+    for place in ("plan.find_plan", "simulate.SimulatedCell", "compensate.corrected", "campaign._problem"):
+        monkeypatch.setattr(f"calib_planner.cli.{place}", None, raising=False)
+    assert main(words.split()) == 2
+    assert option in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+    assert (tmp_path / "good.csv").read_text() == "kept"
+
+
+def test_an_instrument_in_millimetres_is_told(capsys):
+    assert main(f"{PLAN} 2 --test-pose 0,0 --sigma 0.03 --json".split()) == 0
+    assert "--sigma: 30 mm" in capsys.readouterr().err
+    assert main(f"{PLAN} 2 --test-pose 0,0 --sigma 0.001 --json".split()) == 0
+    assert "millimetres?" not in capsys.readouterr().err
