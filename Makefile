@@ -27,7 +27,7 @@ lint: setup ## ruff and mypy
 	@. ./env.sh && ruff check . && ruff format --check . && mypy
 
 bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (minutes; JSON to results/)
-	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot half_and_double identification coverage streaming; do \
+	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot half_and_double minutes identification coverage streaming; do \
 	  echo "== $$name"; python bench/$$name.py > results/$$name.json || exit 1; done
 
 soak: setup ## the identifier at 1 kHz for 10 minutes: none lost, memory flat (SOAK='--minutes 2'; JSON to results/)

@@ -1,6 +1,6 @@
 """How many random visits, and how many minutes, are as good as 15 planned ones?
 
-    python bench/minutes.py [--data ../shared/data] [--seeds 6] [--robots NAME …] [--share 0.3] [--json FILE]
+    python bench/minutes.py [--data ../shared/data] [--seeds 6] [--robots NAME …] [--share 0.3]
 
 For simulated robots and for a measured UR10: all placement errors, tracker and reflector are unknown; the default
 estimator identifies from the visits, and the mean error at configurations that took no part judges them. They are
@@ -200,7 +200,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--robots", nargs="+", default=["kuka_kr270", "ur10e", "irb120", "measured_ur10"])
     parser.add_argument("--share", type=float, default=1.0)
-    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     results = []
     for name in args.robots:
@@ -211,9 +210,8 @@ def main() -> None:
             results.append(compare(name, measured(args.data, args.seeds)))
         else:
             results.append(compare(name, simulated(urdf if name == "irb120" else name, args.seeds, args.share)))
-    print(table(results))
-    if args.json:
-        args.json.write_text(json.dumps({"minutes": results}, indent=1) + "\n", encoding="utf-8")
+    print(table(results), file=sys.stderr)
+    print(json.dumps({"minutes": results}, indent=1))
 
 
 if __name__ == "__main__":

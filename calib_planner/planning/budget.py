@@ -51,6 +51,8 @@ STEP = 1.5
 """Factor between the numbers of configurations that are tried for a time."""
 CLOSE = 1.15
 """Numbers of configurations with a smaller quotient are not told apart: their plans differ as searches do."""
+CLEAR = 0.05
+"""Difference of log Ψ, or of the logarithm of the time, that no irregularity of a search explains."""
 PORTION = 20
 """A PORTION-th of the visits that are left is given away before the gains are computed again."""
 
@@ -403,7 +405,9 @@ class _Attempt:
     @cached_property
     def merit(self) -> float:
         """What is to be large."""
-        return -self.tour.seconds(self.counts) if self.by_time else self.tour.log_value(self.counts)
+        if self.by_time:
+            return -float(np.log(self.tour.seconds(self.counts)))
+        return self.tour.log_value(self.counts)
 
 
 def _best_size(
@@ -413,7 +417,7 @@ def _best_size(
 
     Args:
         attempt: The best with so many configurations; ``None`` if there is nothing.
-        ways: What to try, in this order, until it has become worse twice or nothing comes of it any more; all
+        ways: What to try, in this order, until it has become worse twice, or clearly, or nothing comes of it; all
             begin with the same number, and a further one is tried only if something came of that and it is
             still the best.
         watch: Told how many are done.
@@ -437,7 +441,7 @@ def _best_size(
             if merit(m) > merit(best):
                 best, worse = m, 0
             elif m != best and np.isfinite(merit(best)):
-                worse += 2 if nothing else 1
+                worse += 2 if nothing or merit(m) < merit(best) - CLEAR else 1
             if worse >= 2:
                 break
     while True:
