@@ -13,13 +13,16 @@ import numpy as np
 from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
-from calib_planner.io import Reading, angle_factors, read_configurations
+from calib_planner.io import angle_factors
 from calib_planner.robot import Coupling, Robot, check_reflectors, parse_coupling
 from calib_planner.tracker import Isotropic
 from calib_planner.units import UNSAID, Units, length, quantity
 
 if TYPE_CHECKING:
     from calib_planner.planning import Pace
+
+if TYPE_CHECKING:
+    from calib_planner.io import Reading
 
 Commands = Any  # argparse's own type for what add_subparsers returns is private
 Group = argparse._ActionsContainer
@@ -193,6 +196,9 @@ def column_names(text: str) -> tuple[str, ...]:
 
 def reading_of(args: argparse.Namespace, terminal: Terminal | None = None, **more: Any) -> Reading:
     """How the options of ``add_reading`` say that tables are read; ``more``: further fields of ``Reading``."""
+    # What reads tables, 0.05 s, is imported for tables only.
+    from calib_planner.io import Reading
+
     other = Units("mm" if getattr(args, "millimetres", False) else "", "deg" if args.degrees else "")
     note = (terminal or Terminal(json_wanted=args.json)).note
     return Reading(
@@ -265,6 +271,8 @@ def test_poses(robot: Robot, args: argparse.Namespace) -> FloatArray | None:
     if args.test_pose is not None:
         poses.append(joint_rows("--test-pose", args.test_pose, robot, args))
     if getattr(args, "test_path", None) is not None:
+        from calib_planner.io import read_configurations  # as in reading_of
+
         poses.append(read_configurations(args.test_path, robot, reading_of(args)))
     return np.vstack(poses) if poses else None
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from calib_planner.io.conditions import planned_error_model, read_constraints, read_instrument, read_vertical
     from calib_planner.io.csv import format_table, measurements_text, write_configurations, write_measurements
     from calib_planner.io.data import (
-        angle_factors,
         in_units,
         is_bag,
         read_configurations,
@@ -59,6 +58,7 @@ if TYPE_CHECKING:
         read_program_format,
         write_program,
     )
+    from calib_planner.io.sizes import angle_factors
     from calib_planner.io.sources import Sources, read_source, read_sources
     from calib_planner.io.store import (
         ACCEPTED,
@@ -101,8 +101,7 @@ else:
             "cell": "CELL_KEYS EITHER Cell read_cell write_cell",
             "conditions": "planned_error_model read_constraints read_instrument read_vertical",
             "csv": "format_table measurements_text write_configurations write_measurements",
-            "data": "angle_factors in_units is_bag read_configurations read_data read_joints read_plan_csv "
-            "with_units",
+            "data": "in_units is_bag read_configurations read_data read_joints read_plan_csv with_units",
             "error_model": "read_error_model write_error_model",
             "estimate": "SavedEstimate calibrated_robot placement read_estimate write_estimate",
             "kinematics": "read_kinematics write_kinematics",
@@ -111,6 +110,7 @@ else:
             "prior": "read_prior",
             "programs": "HANDSHAKES SETTLE SPEED_SHARE ProgramFormat ProgramSettings controller_axes "
             "program_formats program_name program_text read_program_format write_program",
+            "sizes": "angle_factors",
             "sources": "Sources read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
             "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "

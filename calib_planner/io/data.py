@@ -155,11 +155,6 @@ def read_plan_csv(path: str | Path, robot: Robot, reading: Reading | None = None
     return table.configurations, table.repetitions
 
 
-def angle_factors(robot: Robot, *, degrees: bool) -> FloatArray:
-    """(joints,) what turns input into rad or m: π/180 for angles given in degrees, else 1."""
-    return np.where(robot.joint_is_revolute & degrees, np.pi / 180.0, 1.0)
-
-
 def in_units(robot: Robot, configurations: FloatArray, units: Units) -> FloatArray:
     """(N, joints) configurations [rad | m] as numbers in ``units``, for output; what is not said is SI."""
     angle, metre = ANGLES[units.angle or "rad"], LENGTHS[units.length or "m"]

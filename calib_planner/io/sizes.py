@@ -1,4 +1,4 @@
-"""Units told by the sizes of numbers alone, where nothing is written and nothing is stated.
+"""Units told by the sizes of numbers alone, where nothing is written and nothing is stated; and those of options.
 
 Sizes are trusted only where they leave one reading:
 
@@ -85,3 +85,8 @@ def reach(robot: Robot) -> float:
                 total += min(float(max(low, high)), MILLIMETRES)
     tips = [sum(abs(e.value) for e in target) for target in robot.targets]
     return total + max(tips, default=0.0)
+
+
+def angle_factors(robot: Robot, *, degrees: bool) -> FloatArray:
+    """(joints,) what turns input into rad or m: π/180 for angles given in degrees, else 1."""
+    return np.where(robot.joint_is_revolute & degrees, np.pi / 180.0, 1.0)
