@@ -18,7 +18,7 @@ from itertools import pairwise
 
 from calib_planner.errors import FileFormatError
 from calib_planner.io.table import Table, is_number
-from calib_planner.units import ANGLES, LENGTHS, SPELLINGS, brief, listed
+from calib_planner.units import ANGLES, LENGTHS, SPELLINGS, brief, counted, listed
 
 REPETITIONS = "repetitions"
 """Column of a plan: how often each configuration is measured."""
@@ -388,7 +388,7 @@ def _by_place(table: Table, wanted: _Wanted) -> Meaning:
     good = rest >= 3 and rest % 3 == 0 if wanted.points else rest >= 0 and rest % 3 == 0
     if not good:
         example = " ".join([*wanted.joint_names, *(("x1", "y1", "z1") if wanted.points else ())])
-        got = f"no header, and {width} columns for {example}"
+        got = f"no header, and {counted(width, 'column')} for {example}"
         option = "--columns" if wanted.joints else "--point-columns"
         raise FileFormatError(table.path, "header", got, "column names", f'state {option} "{example}"')
     columns += [_with_unit(table, skip + j, Column("joint", j), "") for j in range(count)]

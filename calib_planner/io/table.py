@@ -329,14 +329,13 @@ class _Sniffer:
     # ── where the rows begin, and what stands above them ─────────────────────────────────────────────────
 
     def _first_row(self) -> tuple[int, int]:
-        """Index of the line in which the rows begin, and the number of cells that most lines have."""
-        later = self.sample[-(len(self.sample) * 3 // 4 + 1) :]
-        width = Counter(len(loosely(s, self.separator)) for s in later).most_common(1)[0][0]
+        """Index of the line in which the rows begin, and the number of cells that most rows have."""
+        sampled = [loosely(s, self.separator) for s in self.sample]
+        rows = [cells for cells in sampled if _mostly_numbers(cells)] or sampled
+        width = Counter(map(len, rows)).most_common(1)[0][0]
         for i, (_, text) in enumerate(self.lines[:SAMPLE]):
             cells = loosely(text, self.separator)
-            filled = [c for c in cells if c]
-            numbers = sum(map(is_number, filled))
-            if numbers and 2 * numbers >= len(filled) and abs(len(cells) - width) <= 1:
+            if abs(len(cells) - width) <= 1 and _mostly_numbers(cells):
                 return i, width
         known = [i for i, (_, s) in enumerate(self.lines[:SAMPLE]) if self._known(loosely(s, self.separator))]
         begin = known[0] + 1 if known else 1
@@ -465,6 +464,12 @@ def _joined(text: str) -> str:
 def is_number(cell: str) -> bool:
     """Whether a cell is a number, with either decimal mark."""
     return bool(PLAIN.fullmatch(cell) or COMMA.fullmatch(cell))
+
+
+def _mostly_numbers(cells: Sequence[str]) -> bool:
+    """Whether half of the filled cells at least are numbers."""
+    filled = [c for c in cells if c]
+    return bool(filled) and 2 * sum(map(is_number, filled)) >= len(filled)
 
 
 def _share(lines: Sequence[str], mark: str) -> float:

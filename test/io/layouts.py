@@ -300,6 +300,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "trailing separators": Layout(separator=";", trailing=True),
     "titles, one of them padded": Layout(separator=";", titles=("Report;;;;;;;;;;;", "Cell 4;;;;;;;;;;;")),
+    "many titles": Layout(separator=";", titles=tuple(f"setting {i}: on" for i in range(60)), header=False),
     "title with a date": Layout(titles=("2026-11-28, 12:00, cell 4",)),
     "NumPy's savetxt": Layout(separator=" ", header="#"),
     "MATLAB's comment": Layout(separator="\t", titles=("% made by MATLAB", "%"), header=False),

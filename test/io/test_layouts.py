@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from layouts import DATA, LAYOUTS, ROBOT, Layout, write
 from robots import mixed, repeats
 
-from calib_planner import FileFormatError, Measurements
+from calib_planner import CalibPlannerError, FileFormatError, Measurements
 from calib_planner.cli.arguments import column_names
 from calib_planner.errors import MissingExtraError
 from calib_planner.io import Reading, format_table, in_units, read_data, read_joints, read_source, with_units
@@ -278,3 +278,23 @@ def test_the_line_that_is_said(tmp_path: Path) -> None:
         f"{path}: text in Windows-1252 with semicolon, 24 rows; decimal comma; 2 title lines skipped; columns by "
         "name: j1 j2 j3 j4 j5 j6 x1 y1 z1 x2 y2 z2; angles in deg (as written); lengths in m (as written)"
     ]
+
+
+@pytest.mark.parametrize("kind", ["npy", "structured", "npz", "mat", "mat_struct", "records", "xlsx"])
+def test_no_byte_of_another_kind_of_file_brings_a_traceback(tmp_path: Path, kind: str) -> None:
+    if kind == "xlsx":
+        pytest.importorskip("openpyxl")
+    path = write(tmp_path, DATA.select(range(4)), Layout(kind=kind))
+    sound, rng = path.read_bytes(), np.random.default_rng(5)
+    refused = 0
+    for turn in range(repeats(15, 300)):
+        data = bytearray(sound)
+        for at in rng.integers(len(data), size=rng.integers(1, 20)):
+            data[at] = rng.integers(256)
+        path.write_bytes(data[: rng.integers(1, len(data))] if turn % 3 == 0 else data)
+        try:
+            assert np.isfinite(read_data(path, ROBOT).data.q).all()
+        except CalibPlannerError as error:
+            assert "\n" not in str(error) and len(str(error)) < 2500
+            refused += 1
+    assert refused > 3
