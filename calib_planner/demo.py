@@ -45,6 +45,8 @@ RANDOM_PLANS = 12
 PAGE = "calibration.html"
 """The report, in the folder of a demonstration."""
 ROBOT = "kuka_kr270"
+SEED = 3
+"""A robot that errs by 5 mm at the test pose before its calibration; those of other seeds err by 1 … 12 mm."""
 ERROR_MODEL = "typical"
 """How the robot of the demonstrations errs besides its parameters, see ``read_error_model``."""
 TEST_POSE = tuple(np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0]))
@@ -69,7 +71,7 @@ class DemoSettings:
     sigma: float = 3e-5
     starts: int = 64
     random_plans: int = RANDOM_PLANS
-    seed: int = 0
+    seed: int = SEED
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,8 @@ def run_demo(
     model = planned_error_model(ERROR_MODEL, robot, settings.sigma)
     problem = PlanProblem(robot, [TEST_POSE], *size, error_model=model, search=search)
     best = plan(problem, callback)
-    truth_seed, noise_seed, chance_seed = independent_seeds(settings.seed, 3)
-    cell = demo_cell(robot, truth_seed, settings.sigma)
+    noise_seed, chance_seed = independent_seeds(settings.seed, 2)
+    cell = demo_cell(robot, settings.seed, settings.sigma)
     data = cell.measure(best.configurations, best.repetitions, noise_seed)
     measured = IdentificationProblem(robot, data, settings.sigma, test_poses=[TEST_POSE])
     estimate = identify(measured)

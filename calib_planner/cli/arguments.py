@@ -98,8 +98,8 @@ def switch(group: Group, flag: str, text: str) -> None:
     group.add_argument(flag, action="store_true", help=text)
 
 
-def add_seed(parser: Group) -> None:
-    option(parser, "--seed", "N", "seed of all random numbers; the same seed gives the same result", 0)
+def add_seed(parser: Group, usual: int = 0) -> None:
+    option(parser, "--seed", "N", "seed of all random numbers; the same seed gives the same result", usual)
 
 
 def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: bool = True) -> None:

@@ -22,7 +22,7 @@ def add(commands: Commands, summary: str) -> None:
     option(parser, "--configurations", "M", "number of different configurations", usual.configurations)
     option(parser, "--repetitions", "K", "number of measurements at each configuration", usual.repetitions)
     option(parser, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", usual.sigma)
-    add_seed(parser)
+    add_seed(parser, usual.seed)
     option(
         parser, "--output", "DIR", "folder for the files; DIR-2, DIR-3 … beside earlier results", "results/demo"
     )

@@ -37,6 +37,7 @@ from calib_planner.demo import (
     ERROR_MODEL,
     PAGE,
     ROBOT,
+    SEED,
     TEST_POSE,
     DemoResult,
     demo_cell,
@@ -333,7 +334,7 @@ def main(args: Sequence[str] | None = None) -> int:
         description="Calibrate a simulated KUKA KR-270 over ROS 2 and compare with the truth.",
     )
     parser.add_argument("--configurations", type=int, default=30, help="configurations (default 30)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of true errors, noise and search")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"seed of true errors, noise and search ({SEED})")
     parser.add_argument("--output", type=Path, default=Path("calib_planner_demo"), help="folder for files")
     parser.add_argument("--json", action="store_true", help="the result as one JSON object on stdout")
     chosen = parser.parse_args(args)
