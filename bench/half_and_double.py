@@ -22,8 +22,7 @@ import numpy as np
 from calib_planner import IdentificationProblem, Measurements, PlanProblem, Robot, identify, plan
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import Truth, gravity_of, typical
-from calib_planner.planning import usual_error_model
-from calib_planner.planning.extended import UNCERTAIN
+from calib_planner.planning import UNCERTAIN, usual_error_model
 from calib_planner.tracker import Isotropic
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -24,6 +24,7 @@ from calib_planner.planning.constraints import (
 )
 from calib_planner.planning.constraints.self_collision import SelfCollision
 from calib_planner.planning.criteria import CRITERIA, POSE_CRITERIA, Determinant
+from calib_planner.planning.extended import UNCERTAIN
 from calib_planner.planning.feasibility import Constraint, Feasibility
 from calib_planner.planning.information import (
     InformationModel,

@@ -36,6 +36,7 @@ from calib_planner.planning.bound import approximate_design
 from calib_planner.planning.extended import UNCERTAIN, ExtendedModel
 from calib_planner.planning.information import spread_spaces
 from calib_planner.planning.planner import _design_problem, value_of
+from calib_planner.planning.search.apart import APART, nearest, repelling
 from calib_planner.planning.search.exchange import ChoiceProblem, _information, choose
 from calib_planner.robot import Coupling
 from calib_planner.tracker import Isotropic, LaserTracker
@@ -232,12 +233,13 @@ def test_the_bound_of_a_design_is_not_beaten() -> None:
 
 
 def test_stops_spread_by_themselves() -> None:
-    """No two stops within the length of the joints' short functions, although nothing forbids it."""
+    """No two stops within the length of the joints' short functions; at the test pose itself there is one."""
     model = with_wide_placement(typical(Isotropic(3e-5)))
     found = plan(PlanProblem(kuka(("base", "tool")), POSE, 12, error_model=model, search=FEW))
     q = found.configurations
     apart = np.abs(q[:, None] - q[None]).max(axis=2) + 9.0 * np.eye(len(q))
     assert apart.min() > 2 * model.values["short.length"]
+    assert nearest(kuka(), q) >= APART
     assert found.quality.status == "ok"
     assert found.quality.lower_bound <= found.quality.predicted_accuracy
     told = Knowledge.of_plan(kuka(("base", "tool")), model, q).accuracy(POSE[None]).value
@@ -250,6 +252,22 @@ def test_stops_spread_by_themselves() -> None:
         "points",
     }
     assert all(t.std < t.size for t in found.quality.terms if t.name in ("gravity", "joint_functions"))
+
+
+def test_visits_that_are_near_push_each_other_away() -> None:
+    """The cost of near pairs by central differences; copies that a turn parts count as near."""
+    robot, rng = kuka(), np.random.default_rng(4)
+    q = 0.03 * rng.standard_normal((2, 4, 6))
+    q[0, 1] += 2 * np.pi * np.eye(6)[3]
+    rows = q.reshape(2, -1)
+    cost = repelling(lambda x: (np.zeros(len(x)), np.zeros(x.shape)), robot, 4)
+    value, gradient = cost(rows)
+    assert (value > 0).all()
+    steps = 1e-6 * np.eye(24)
+    differences = [(cost(rows + s)[0] - cost(rows - s)[0]) / 2e-6 for s in steps]
+    np.testing.assert_allclose(gradient, np.transpose(differences), rtol=1e-6, atol=1e-6)
+    far = np.concatenate([q, q + 1.0])[:, :1].reshape(1, 4, 6) + np.arange(4)[:, None]
+    assert cost(far.reshape(1, -1))[0] == 0.0 and nearest(robot, far)[0] > APART
 
 
 def test_candidates_are_exchanged_until_no_other_is_better() -> None:

@@ -12,6 +12,9 @@ allowed set (see ``interior``): what comes out is feasible by construction. An e
 show, because it says no more than yes or no, is not followed; with such a constraint the best plan of each part
 is then improved by random feasible steps (see ``wander``) and descents in turn.
 
+Visits. With a whole error model all configurations of a plan keep apart (see ``apart``): what comes out are as
+many different ones as were wanted.
+
 Work is cut into independent ``parts`` with their own seeds, whatever executes them: same seed, same plan.
 """
 
@@ -27,6 +30,7 @@ from calib_planner.planning.criteria import Criterion, ridged
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.feasibility import Feasibility, PlanWalls
 from calib_planner.planning.information import InformationModel, Model
+from calib_planner.planning.search.apart import repelling
 from calib_planner.planning.search.descent import Descent, Objective, descend, wander
 from calib_planner.planning.search.interior import descend_inside
 
@@ -200,7 +204,7 @@ def _starts(
     rounded = -(-starts * (2 if extended else 1) // 3) if len(problem.support) else 0
     if rounded:
         picks = rng.choice(len(problem.support), (rounded, size), p=problem.weights)
-        parts.append(_shake(problem, problem.support[picks], rng))
+        parts.append(shake(problem, problem.support[picks], rng))
     # So many configurations are needed to identify everything without a prior.
     robot = problem.model.robot
     kernel_size = max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
@@ -212,14 +216,14 @@ def _starts(
         evaluations += kernel.evaluations
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
-        parts.append(_shake(problem, kernel.x[best].reshape(len(best), kernel_size, -1)[:, rows], rng))
+        parts.append(shake(problem, kernel.x[best].reshape(len(best), kernel_size, -1)[:, rows], rng))
     random = max(starts - rounded - tiled, 0 if extended and rounded else 1)
     if random:
         parts.append(draw(rng, random * size).reshape(random, size, -1))
     return np.concatenate(parts), evaluations
 
 
-def _shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
+def shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Move copies apart a little, where that is feasible."""
     low, high = problem.feasibility.limits.T
     moved = np.clip(plans + rng.normal(0.0, 0.02, plans.shape), low, high)
@@ -238,6 +242,8 @@ def descend_from(
     low, high = (np.tile(side, size) for side in problem.feasibility.limits.T)
     flat = rows.reshape(len(rows), -1)
     objective = plan_objective(problem, size) if objective is None else objective
+    if isinstance(problem.model, ExtendedModel):
+        objective = repelling(objective, problem.model.robot, size)
     beside = max(BATCH // flat.shape[1] ** 2, 1)
 
     def improved(part: FloatArray) -> Descent:

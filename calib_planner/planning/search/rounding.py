@@ -20,6 +20,8 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.planning.criteria import is_sharp, log_values, ridged, sharpened
+from calib_planner.planning.extended import ExtendedModel
+from calib_planner.planning.search.apart import APART, nearest
 from calib_planner.planning.search.enumeration import best_of_all, seconds
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.search.multistart import (
@@ -28,6 +30,7 @@ from calib_planner.planning.search.multistart import (
     descend_from,
     efforts,
     mean_objective,
+    shake,
 )
 
 STEPS = (1.0, 4.0, 16.0, 64.0)
@@ -80,6 +83,9 @@ def improved(
     the mean over all of them.
     """
     steps = STEPS if is_sharp(problem.criterion) else STEPS[:1]
+    if isinstance(problem.model, ExtendedModel):
+        crowded = nearest(problem.model.robot, plans) < APART
+        plans = np.where(crowded[:, None, None], shake(problem, plans, np.random.default_rng(0)), plans)
     rows: FloatArray = plans.reshape(len(plans), -1)
     work = 0
     every = [rows]
@@ -89,7 +95,7 @@ def improved(
         descent = descend_from(sharp, problem.size, rows, cancel, efforts(problem)[1], objective=mean)
         rows, work = descent.x, work + descent.evaluations
         every.append(rows)
-    flat = np.concatenate(every)
+    flat = _apart(problem, np.concatenate(every))
     q = flat.reshape(len(flat) * problem.size, -1)
     logs, exact = [], []
     for part in (problem, *problem.beside):
@@ -100,3 +106,11 @@ def improved(
     best = int(np.argmax(np.mean(exact, axis=0)))
     log_value = float(np.mean(logs, axis=0)[best])
     return SearchResult(flat[best].reshape(problem.size, -1), log_value, len(plans), work)
+
+
+def _apart(problem: SearchProblem, rows: FloatArray) -> FloatArray:
+    """Those of the plans ``rows`` whose visits are different where they have to be; else the nearest to that."""
+    if not isinstance(problem.model, ExtendedModel):
+        return rows
+    least = nearest(problem.model.robot, rows.reshape(len(rows), problem.size, -1))
+    return rows[least >= min(APART, least.max())]
