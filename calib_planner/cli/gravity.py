@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.cli.arguments import Group, numbers, option
+from calib_planner.cli.arguments import Group, numbers, option, quantity_in
 from calib_planner.error_model import LINKS, ErrorModel, Gravity, Payload, gravity_of
 from calib_planner.errors import InputError
 from calib_planner.io import read_error_model, read_vertical
@@ -24,7 +24,13 @@ STEEP = 0.94
 def add_payload(group: Group, otherwise: str) -> None:
     """--payload; ``otherwise`` says what is taken without it."""
     text = "what the robot carries: mass [kg], centre of gravity in the frame of the last link [m]; or mass alone"
-    option(group, "--payload", '"MASS X Y Z"', f"{text} ({otherwise})", kind=numbers)
+    option(group, "--payload", '"MASS X Y Z"', f"{text} ({otherwise})", kind=_masses)
+
+
+def _masses(text: str) -> list[float]:
+    """A mass [kg] and lengths [m], each with or without its unit: ``2.5kg 0 0 50mm``."""
+    mass, *place = text.replace(",", " ").split() or [""]
+    return [quantity_in("kg")(mass), *map(quantity_in("m"), place)]
 
 
 def add_gravity(parser: argparse.ArgumentParser, *, measured: bool = True) -> None:

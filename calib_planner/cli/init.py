@@ -146,7 +146,7 @@ def _ask(args: argparse.Namespace, terminal: Terminal) -> None:
         if getattr(args, action.dest) is not None or (key == "instrument" and args.sigma is not None):
             continue
         while True:
-            terminal.err.print(question.format(robots=", ".join(shipped_robots())), end=": ")
+            terminal.err.print(question.format(robots=", ".join(shipped_robots())), end=": ", soft_wrap=True)
             text = sys.stdin.readline()
             if not text.strip():
                 if key == "robot" and text:
@@ -189,6 +189,7 @@ class Trial:
         unknown: What has to be unknown for the points to fit: ``base``, ``tool``.
         after: Median distance with that placed by the points alone [m]; infinite where they cannot place it.
         spread: Median distance of the points from their centre [m].
+        places: Where the points put reflectors that are unknown, in the frame of the last link, to 0.1 mm [m].
     """
 
     file: str
@@ -200,6 +201,7 @@ class Trial:
     unknown: tuple[str, ...]
     after: float
     spread: float
+    places: tuple[tuple[float, ...], ...] = ()
 
     @property
     def agrees(self) -> bool:
@@ -260,25 +262,25 @@ def _trial(args: argparse.Namespace, robot: Robot, data: Measurements, units: tu
     alike = robot.with_targets(np.zeros((count, 3))) if strange else robot
     answer = find_misplacement(alike, data)
     unknown = tuple(w for w in ("base", "tool") if w in answer.unknown or (strange and w == "tool"))
-    after = answer.after
     if args.unknown:
         unknown = tuple(u.strip() for u in args.unknown.split(",") if u.strip() not in ("", "none"))
-        after = (
-            _distance(alike.with_parameters(alike.parameter_names, unknown), data) if unknown else answer.before
-        )
+    placed, after = alike, answer.before
+    if unknown:
+        placed, after = _placed(alike.with_parameters(alike.parameter_names, unknown), data)
+    places = tuple(map(tuple, np.round(placed.target_offsets, 4).tolist())) if "tool" in unknown else ()
     seen = data.p[data.seen]
     spread = float(np.median(np.linalg.norm(seen - seen.mean(axis=0), axis=1)))
-    return Trial(args.data, len(data), count, len(seen), units, answer.before, unknown, after, spread)
+    size = (len(data), count, len(seen))
+    return Trial(args.data, *size, units, answer.before, unknown, after, spread, places)
 
 
-def _distance(robot: Robot, data: Measurements) -> float:
-    """Median distance of the points from the robot with what is unknown of its placement fitted [m]."""
+def _placed(robot: Robot, data: Measurements) -> tuple[Robot, float]:
+    """The robot with what is unknown of its placement fitted, and the points' median distance from it [m]."""
     try:
-        placed = place_nominal(IdentificationProblem(robot, data))
+        placed = replace(place_nominal(IdentificationProblem(robot, data)), parameter_names=())
     except NotEnoughDataError:
-        return float("inf")
-    points = replace(placed, parameter_names=()).positions(data.q)
-    return float(np.median(np.linalg.norm(data.p - points, axis=2)[data.seen]))
+        return robot, float("inf")
+    return placed, float(np.median(np.linalg.norm(data.p - placed.positions(data.q), axis=2)[data.seen]))
 
 
 # ── what is written and said ─────────────────────────────────────────────────────────────────────────
@@ -306,8 +308,10 @@ def _values(args: argparse.Namespace, trial: Trial | None) -> dict[str, Any]:
     units = stated if trial is None else list(trial.units)
     if units:
         values["units"] = ",".join(units)
-    if trial is not None and trial.agrees and "unknown" not in values:
-        values["unknown"] = ",".join(trial.unknown) or "none"
+    if trial is not None and trial.agrees:
+        values.setdefault("unknown", ",".join(trial.unknown) or "none")
+        if trial.places:  # a plan has to know about where they are, and how many
+            values.setdefault("targets", [list(place) for place in trial.places])
     return values
 
 

@@ -47,14 +47,18 @@ def init(capsys: pytest.CaptureFixture[str], *words: str) -> Any:
 def test_a_cell_from_options_is_what_identify_needs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "cells").mkdir()
     line = "--robot ur10e --data mm_deg.csv --sigma 20um --constraints low.yaml --output cells/cell.yaml"
-    found = init(capsys, *line.split(), "--payload", "2", "--mounting", "0 0 -1")
+    found = init(capsys, *line.split(), "--payload", "2kg 0 0 50mm", "--mounting", "0 0 -1")
     trial = found["data"]
     assert trial["agrees"] and trial["unknown"] == ["base", "tool"] and trial["units"] == ["mm", "deg"]
     assert (trial["visits"], trial["targets"], trial["points"]) == (20, 1, 20)
     assert trial["after"] < 0.01 < 0.1 < trial["before"]
     cell = read_cell("cells/cell.yaml")
     assert cell.unknown == ("base", "tool") and cell.units == ("mm", "deg") and cell.sigma == 2e-5
-    assert cell.constraints == "cells/../low.yaml" and cell.payload == (2.0,) and cell.mounting == (0, 0, -1)
+    assert (
+        cell.constraints == "cells/../low.yaml"
+        and cell.payload == (2.0, 0.0, 0.0, 0.05)
+        and cell.mounting == (0, 0, -1)
+    )
     assert main(["identify", "--cell", "cells/cell.yaml", "--data", "mm_deg.csv", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["noise"]["source"] == "sigma" and result["residual_after"]["rms"] < 1e-3
