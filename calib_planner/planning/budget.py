@@ -52,7 +52,7 @@ STEP = 1.5
 CLOSE = 1.15
 """Numbers of configurations with a smaller quotient are not told apart: their plans differ as searches do."""
 CLEAR = 0.05
-"""Difference of log Ψ, or of the logarithm of the time, that no irregularity of a search explains."""
+"""Difference of log Ψ, or of the logarithm of the time, beyond that of two visits, that is no irregularity."""
 PORTION = 20
 """A PORTION-th of the visits that are left is given away before the gains are computed again."""
 
@@ -431,6 +431,11 @@ def _best_size(
             watch(len(known), max(len(known) + 1, 6))
         return known[m][0]
 
+    def clear(m: int) -> float:
+        made = known[m][1]
+        assert made is not None
+        return CLEAR + 2.0 / float(made.counts.sum())  # only whole visits fit: one more or less may be chance
+
     best = first = ways[0][0]
     for number, sizes in enumerate(ways):
         worse = 0
@@ -441,7 +446,7 @@ def _best_size(
             if merit(m) > merit(best):
                 best, worse = m, 0
             elif m != best and np.isfinite(merit(best)):
-                worse += 2 if nothing or merit(m) < merit(best) - CLEAR else 1
+                worse += 2 if nothing or merit(m) < merit(best) - clear(best) else 1
             if worse >= 2:
                 break
     while True:
