@@ -9,12 +9,28 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 
 from calib_planner import PlanProblem, Robot, plan
-from calib_planner.planning import InformationModel, plan_space
+from calib_planner.planning import (
+    Constraint,
+    InformationModel,
+    JointRange,
+    LineOfSight,
+    MinimumHeight,
+    ReflectorAcceptance,
+    Search,
+    SelfCollision,
+    TrackerElevation,
+    TrackerRange,
+    WorkspaceBox,
+    plan_space,
+)
+from calib_planner.robot import Capsules
 
 TARGETS = {3: 0.94, 4: 0.985, 6: 0.99, 12: 0.99}
 """Configurations: smallest efficiency wanted."""
@@ -76,14 +92,70 @@ def scaling(robot: Robot) -> dict[str, dict[int, float]]:
     return table
 
 
+STATION = np.array([4.0, 1.5, 1.2])
+RADII = [0.30, 0.25, 0.18, 0.15, 0.12, 0.12, 0.10]
+"""Of the body's capsules and of the cylinders that may not collide [m]."""
+
+
+def eight_constraints(robot: Robot, folder: Path) -> tuple[Constraint, ...]:
+    """A cell with a tracker in front of the robot; links that collide are a URDF of cylinders in ``folder``."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+    from robots import cylinder_urdf
+
+    (folder / "cylinders.urdf").write_text(cylinder_urdf(robot, RADII))
+    body = Capsules(RADII)
+    return (
+        JointRange({"joint_a4": [-np.pi, np.pi], "joint_a6": [-np.pi, np.pi]}),
+        WorkspaceBox([0.3, -2.0, 0.3], [3.0, 2.0, 2.5]),
+        MinimumHeight(0.2, capsules=body),
+        TrackerRange(STATION, 1.0, 6.0),
+        TrackerElevation(STATION, low=-0.8, high=1.0),
+        ReflectorAcceptance(STATION, [1, 0, 0], np.pi / 6),
+        LineOfSight(STATION, body, near=0.2),
+        SelfCollision(folder / "cylinders.urdf"),
+    )
+
+
+def constrained(robot: Robot, seeds: int, more: int = 20) -> list[dict[str, float]]:
+    """Plans with eight constraints against the best with ``more`` times the starts; seconds of processor time."""
+    pose, rows = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0]), []
+    with tempfile.TemporaryDirectory() as folder:
+        constraints = eight_constraints(robot, Path(folder))
+        for m in (6, 12):
+
+            def made(seed: int, starts: int, m: int = m) -> tuple[float, float]:
+                began = time.process_time()
+                search = Search(seed=seed, starts=starts)
+                best = plan(PlanProblem(robot, pose, m, constraints=constraints, search=search))
+                return best.quality.predicted_accuracy, time.process_time() - began
+
+            accuracy, seconds = np.array([made(k, 48) for k in range(seeds)]).T
+            long = min(accuracy.min(), *(made(1_000 + k, 48 * more)[0] for k in range(2)))
+            row = {
+                "configurations": m, "seeds": seeds, "long": long, "worst": float(long / accuracy.max()),
+                "median": float(np.median(long / accuracy)), "seconds": float(np.median(seconds)),
+            }  # fmt: skip
+            rows.append(row)
+            print(f"eight constraints: {row}", file=sys.stderr)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--poses", type=int, default=50)
+    text = "only plans with eight constraints, this many seeds"
+    parser.add_argument("--constrained", type=int, metavar="SEEDS", help=text)
     args = parser.parse_args()
     robot = Robot.load("kuka_kr270")
+    if args.constrained:
+        print(json.dumps({"constrained": constrained(robot, args.constrained)}))
+        return
     low, high = robot.joint_limits.T
     poses = np.random.default_rng(2026).uniform(low, high, (args.poses, 6))
-    print(json.dumps({"efficiency": efficiencies(robot, poses), "scaling": scaling(robot)}))
+    result = {
+        "efficiency": efficiencies(robot, poses), "constrained": constrained(robot, 5), "scaling": scaling(robot),
+    }  # fmt: skip
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":
