@@ -153,7 +153,10 @@ def add_parameters(parser: argparse.ArgumentParser, unknown: str = "none") -> No
 def add_reading(parser: argparse.ArgumentParser) -> None:
     """What may be stated about tables that are read."""
     group = parser.add_argument_group("tables that are read (what is not stated is recognised, and said)")
-    text = "units of lengths and angles in files, and of angles in arguments: m, mm, cm, in, …; rad, deg, …"
+    text = (
+        "units of lengths and angles in files and of angles in arguments, and of a CSV of configurations that is "
+    )
+    text += "written: m, mm, cm, in, …; rad, deg, …"
     group.add_argument("--units", action=_Units, metavar="U", help=f"{text} (m,rad)")
     text = "names of all columns, in order: joints, x1 y1 z1 x2 …, std_x1 …; '-' for one that plays no part"
     option(group, "--columns", '"q1 … z1"', text, kind=column_names)
@@ -209,6 +212,18 @@ def reading_of(args: argparse.Namespace, terminal: Terminal | None = None, **mor
         note=note,
         **more,
     )
+
+
+def configurations_in(units: Units | None, robot: Robot, q: FloatArray) -> tuple[tuple[str, ...], FloatArray]:
+    """Names and numbers (N, joints) of configurations ``q`` [rad | m] for a table in the units of --units.
+
+    Units that are stated stand in the names, so that the table is read again as it is.
+    """
+    if units is None:
+        return robot.joint_names, q
+    from calib_planner.io import in_units, with_units  # as in reading_of
+
+    return with_units(robot, units), in_units(robot, q, units)
 
 
 def add_test_poses(parser: Group, purpose: str) -> None:

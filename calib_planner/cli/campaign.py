@@ -38,6 +38,7 @@ from calib_planner.cli.arguments import (
     add_test_poses,
     choose_parameters,
     conditions,
+    configurations_in,
     load_robot,
     option,
     reading_of,
@@ -182,7 +183,8 @@ def _by_hand(args: argparse.Namespace, problem: CampaignProblem, terminal: Termi
     times = [state.queue.count(i) for i in numbers]
     role = state.configurations[numbers[0]].role
     if args.next:
-        write_configurations(args.next, problem.robot.joint_names, q, times, field="--next")
+        names, rows = configurations_in(args.units, problem.robot, q)
+        write_configurations(args.next, names, rows, times, field="--next")
     result = {
         "outcome": state.outcome or None,
         "message": state.message,

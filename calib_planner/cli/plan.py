@@ -26,6 +26,7 @@ from calib_planner.cli.arguments import (
     choose_parameters,
     chosen_pace,
     conditions,
+    configurations_in,
     load_robot,
     numbers,
     option,
@@ -75,7 +76,7 @@ from calib_planner.planning import (
 from calib_planner.planning import plan as find_plan
 from calib_planner.robot import Robot
 from calib_planner.tracker import Noise
-from calib_planner.units import duration, length
+from calib_planner.units import Units, duration, length
 
 PAPER = "paper"
 EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" \\
@@ -137,7 +138,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
             with processes(args.jobs, "--jobs") as executor:
                 plan = find_plan(problem, report, executor, prove=args.prove)
     if args.output:
-        _write(args.output, plan)
+        _write(args.output, plan, problem.robot, args.units)
     if args.sheet:
         # 0.1 s for templates, which only a sheet waits for.
         from calib_planner.report import write_sheet
@@ -212,9 +213,10 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
     option(parser, "--jobs", "N", text, 1)
 
 
-def _write(output: str, plan: Plan) -> None:
+def _write(output: str, plan: Plan, robot: Robot, units: Units | None) -> None:
     if output.lower().endswith(".csv"):
-        write_configurations(output, plan.joint_names, plan.configurations, plan.repetitions, field="--output")
+        names, q = configurations_in(units, robot, plan.configurations)
+        write_configurations(output, names, q, plan.repetitions, field="--output")
     else:
         write_plan(output, plan, "--output")
 

@@ -11,7 +11,7 @@ import pytest
 
 from calib_planner import Measurements, Robot
 from calib_planner.cli import main
-from calib_planner.io import read_data, write_configurations, write_measurements
+from calib_planner.io import read_data, read_joints, write_configurations, write_measurements
 
 sys.path.append(str(Path(__file__).parents[1] / "io"))
 from layouts import DATA, LAYOUTS, ROBOT, URDF, Layout, write
@@ -102,3 +102,14 @@ def test_plans_read_the_same_tables(tmp_path: Path, capsys: pytest.CaptureFixtur
         answers.append(json.loads(stdout))
     np.testing.assert_allclose(answers[0]["configurations"], answers[1]["configurations"], atol=1e-12)
     assert answers[0]["predicted_accuracy"] == pytest.approx(answers[1]["predicted_accuracy"], rel=1e-9)
+
+
+def test_units_that_are_stated_are_those_of_the_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, words = tmp_path / "plan.csv", ["--configurations", "2", "--starts", "2", "--units", "mm,deg", "--json"]
+    status, stdout, _ = run(
+        capsys, "plan", "--robot", "planar_2r", "--test-pose", "20 30", *words, "--output", out
+    )
+    assert status == 0 and out.read_text().startswith("q1 [deg],q2 [deg],repetitions\n")
+    table = read_joints(out, Robot.load("planar_2r"))
+    np.testing.assert_allclose(table.configurations, json.loads(stdout)["configurations"], rtol=0, atol=1e-12)
+    assert table.understanding.angle_from == "written"
