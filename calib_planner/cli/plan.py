@@ -255,7 +255,13 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     text = "share of the criterion for accuracy everywhere, 0 … 1; 0 is the paper's"
     text += f" ({PAPERS_SHARE:g}; {GENERAL_SHARE:g} with a whole error model)"
     option(search, "--general-weight", "W", text, kind=float)
-    option(search, "--starts", "N", "number of random starts (48; 8 with a whole error model)", kind=int)
+    option(
+        search,
+        "--starts",
+        "N",
+        "number of random starts (48; with a whole error model 2, or 1 for 20 configurations and more)",
+        kind=int,
+    )
     option(search, "--time-limit", "S", "time after which the search ends [s]", float("inf"))
     add_seed(search)
     return work

@@ -242,12 +242,9 @@ class Gravity:
         """(parts, joints, 3, N) from every joint to every part of a mass [m]; kept with the poses."""
         key = ("arms", self)
         if key not in poses.cache:
-            origins, tip = poses.posture.joint_origins.transpose(1, 2, 0), poses.posture.tip_origin.T
-            points = []
-            for part in self.masses_of(poses.robot):
-                at = tip if part.joint is None else origins[part.joint]
-                known = any(part.xyz)
-                points.append(link_points(poses.robot, poses.q, part.joint, part.xyz).T if known else at)
+            origins = poses.posture.joint_origins.transpose(1, 2, 0)
+            parts = self.masses_of(poses.robot)
+            points = [link_points(poses.robot, poses.q, part.joint, part.xyz).T for part in parts]
             poses.cache[key] = np.stack(points)[:, None] - origins
         return poses.cache[key]
 
@@ -310,9 +307,9 @@ def _direction(field: str, given: ArrayLike, way: str) -> tuple[float, float, fl
     return x, y, z
 
 
-def link_points(robot: Robot, q: FloatArray, joint: int | None, xyz: ArrayLike) -> FloatArray:
+def link_points(robot: Robot, q: FloatArray, joint: int | None, xyz: tuple[float, float, float]) -> FloatArray:
     """(N, 3) where ``xyz`` (3,) of the link that joint number ``joint`` moves is; ``None``: of the tip [m]."""
-    x, y, z = check_array("mass", xyz, (3,))
+    x, y, z = xyz
     part = _link(robot, joint, (float(x), float(y), float(z)))
     return part.positions(robot.motions(q)[:, : len(part.joint_names)])[:, 0]
 

@@ -93,10 +93,7 @@ class JointFunctions:
         low, high = poses.robot.joint_limits.T
         turns = poses.robot.joint_is_revolute
         x = np.where(turns, poses.q, np.pi * (poses.q - low) / (high - low))
-        turned = np.exp(1j * x)[..., None]
-        while turned.shape[2] < self.harmonics:  # powers 1 … k times the k-th are k + 1 … 2k
-            turned = np.concatenate([turned, turned * turned[..., -1:]], axis=2)
-        turned = turned[..., : self.harmonics]
+        turned = np.exp(1j * x)[..., None] ** np.arange(1, self.harmonics + 1)
         return np.concatenate([turned.real, turned.imag], axis=2)
 
     def variances(self, robot: Robot, values: dict[str, float]) -> FloatArray:

@@ -220,6 +220,12 @@ class LinearisedExtension:
         return values, rates
 
     @cached_property
+    def _mapped(self) -> tuple[FloatArray, FloatArray]:
+        """Φ_l times the maps, and its derivative, (N, joints, p) each."""
+        values, rates = (_through(part, self.model.maps) for part in self.features)
+        return values, rates
+
+    @cached_property
     def rest(self) -> FloatArray:
         """(N, joints, F) Φ_l (I − U_l U_lᵀ)."""
         return self.features[0] - _through(self.explicit[0], np.swapaxes(self.model.basis, 1, 2))
@@ -239,7 +245,7 @@ class LinearisedExtension:
             joints = result[:, :, self.model.first :].reshape(n, rows, len(self.model.basis), -1)
             np.multiply(self.levers[..., None], self.explicit[0][:, None], out=joints)
             return result
-        result = self.levers @ _through(self.features[0], self.model.maps)
+        result = self.levers @ self._mapped[0]
         result[:, :, :count] += self.poses.jacobian
         if gravity is not None:
             pushes = self._gravity_levers * self.moments[:, None]
@@ -272,7 +278,7 @@ class LinearisedExtension:
         That is κ_l, and for a configuration with itself the variance of what is new at a visit, divided by
         ``counts`` (N,) if given.
         """
-        n, joints, _ = self.rest.shape
+        n, joints = self.poses.q.shape
         every, own = np.arange(size), np.full(n, self.model.visit_variance)
         if self.model.coupled:
             runs = _by_joint(self.rest, size)
@@ -399,13 +405,16 @@ class LinearisedExtension:
         size, robot, model = n // len(parts[0][1]), self.model.robot, self.model.model
         force: FloatArray = np.zeros((len(parts[0][1]), size * rows, p))
         on_points, on_joints = (np.zeros((len(force), size * rows, size * rows)) for _ in range(2))
+        even = model.points.noise is None or isinstance(model.points.noise, Isotropic)
         for factor, by_matrix in parts:
             solved, scales = self._solved(size, factor)[1], self.model.column_scales(factor)
-            z = solved @ (by_matrix * scales[:, None] * scales)
+            z = solved @ (by_matrix if factor == 1.0 else by_matrix * scales[:, None] * scales)
             k = z @ np.swapaxes(solved, 1, 2)
             force += z
-            on_points += k
-            on_joints += factor**2 * k
+            if not even:
+                on_points += k
+            k *= factor**2
+            on_joints += k
         force *= 2.0  # ∂Ψ/∂X
         force = force.reshape(n, rows, p)
         by_lever, by_joint = self._by_functions(force)
@@ -416,7 +425,8 @@ class LinearisedExtension:
             rates = model.gravity.moment_gradients(self.poses) * model.values["gravity"]
             by_joint += (np.sum(own * self._gravity_levers, axis=1)[:, None] @ rates)[:, 0]
         self._add_kernels(on_joints, size, by_lever, by_joint)
-        self._add_noise(on_points, size, by_joint)
+        if not even:
+            self._add_noise(on_points, size, by_joint)
         return by_joint + self._pulled(force, by_lever)
 
     def _by_functions(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -427,7 +437,7 @@ class LinearisedExtension:
             own = force[:, :, self.model.first :].reshape(n, rows, joints, -1)
             pushed = np.sum(own * self.levers[..., None], axis=1)
             return np.sum(own * values[:, None], axis=3), np.sum(pushed * rates, axis=2)
-        values, rates = (_through(part, self.model.maps) for part in self.features)
+        values, rates = self._mapped
         by_lever = force @ np.swapaxes(values, 1, 2)
         pushed = np.swapaxes(self.levers, 1, 2) @ force
         return np.asarray(by_lever), np.sum(pushed * rates, axis=2)
@@ -446,8 +456,7 @@ class LinearisedExtension:
     def _add_noise(self, k: FloatArray, size: int, by_joint: FloatArray) -> None:
         """−tr(K dN) through the instrument's covariance, which depends on the point; added in place."""
         points = self.model.model.points
-        if points.noise is None or isinstance(points.noise, Isotropic):
-            return
+        assert points.noise is not None
         blocks = _diagonal(k, size, self.jacobian.shape[1])
         n, targets = len(blocks), len(self.model.robot.targets)
         own = blocks.reshape(n, targets, 3, targets, 3)[:, np.arange(targets), :, np.arange(targets), :]

@@ -43,6 +43,7 @@ from calib_planner.planning.search.enumeration import best_of_all
 from calib_planner.planning.search.exchange import ChoiceProblem, check_choice, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.planning.search.rounding import heaviest_places, improved, rounded_rows
+from calib_planner.planning.search.swaps import swapped
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
 
@@ -300,8 +301,8 @@ def _search(
 ) -> SearchResult:
     """Parts of the work, here or by the executor, until enough is known; the best, the first one if equal.
 
-    With a whole error model the rounded design comes first, since descents from it nearly always end higher than
-    others, and parts are added while they end higher still. Else it comes last, where the others are not enough.
+    The rounded design comes last, where the others are not enough. With a whole error model every part begins
+    with one, after swaps.
     """
     nobody = np.empty((0, len(space.robot.joint_names)))
 
@@ -325,15 +326,9 @@ def _search(
     best: SearchResult | None = None
     done = evaluations = 0
     tops: list[float] = []
-    shared = isinstance(space.model, ExtendedModel) and bool(rounded.plans)
-    if shared:
-        best = improved(search, np.stack(rounded.plans), clock.over)
-        evaluations += best.evaluations
     futures = [executor.submit(search_chunk, *job) for job in work] if executor else []
     for index, job in enumerate(work):
         if index and (clock.over() or _agreed(tops) or _good_enough(space, design, best)):
-            break
-        if shared and tops and best is not None and best.log_value > tops[-1]:
             break
         result = futures[index].result() if futures else search_chunk(*job, clock.over)
         tops.append(result.log_value)
@@ -346,8 +341,9 @@ def _search(
     for future in futures:
         future.cancel()
     assert best is not None
-    if not clock.over() and not shared and (is_sharp(criterion) or not _good_enough(space, design, best)):
-        plans = [best.configurations, *rounded.plans]
+    whole = isinstance(space.model, ExtendedModel)
+    if not clock.over() and (is_sharp(criterion) or not (whole or _good_enough(space, design, best))):
+        plans = [best.configurations, *([] if whole else rounded.plans)]
         result = improved(search, np.stack(plans), clock.over)
         evaluations += result.evaluations
         if is_sharp(criterion) or result.log_value > best.log_value:
@@ -369,8 +365,17 @@ class _Rounded:
         space, design = self.space, self.design
         if design is None or np.ndim(space.model.repetitions) or space.problem.candidates is not None:
             return []
+        if isinstance(space.model, ExtendedModel):
+            heavy, size = design.weights > 0, space.problem.configurations
+            support, weights = design.support[heavy], design.weights[heavy]
+            if len(support) < size:
+                return []
+            rng, sizes = (
+                np.random.default_rng(space.problem.search.seed),
+                [(space.model, self.criterion, space.prior)],
+            )
+            return [swapped(sizes, size, support, weights, support[:0], rng)[0]]
         request = _choice(space, self.criterion, design.support, design)
-        request = replace(request, beside=tuple(_scaled_choices(space, self.criterion, request)))
         low, high = space.robot.joint_limits.T
         places = heaviest_places(design.support, design.weights, high - low)
         try:

@@ -7,6 +7,9 @@ Starts. A third draws configurations from the approximate design (see ``bound``)
 rounding it, which the descent then repairs; a third repeats a good small plan, because eq. (20) and the paper's
 Table 2 show that good plans are a few good configurations repeated; the rest is random.
 
+With a whole error model every start is a random draw from the approximate design after swaps with random
+configurations (see ``swaps``): from there one descent ends above the best of eight from elsewhere.
+
 Feasibility. Every start is feasible, and with constraints the descents keep inside and follow the edges of the
 allowed set (see ``interior``): what comes out is feasible by construction. An edge that a constraint does not
 show, because it says no more than yes or no, is not followed; with such a constraint the best plan of each part
@@ -30,9 +33,11 @@ from calib_planner.planning.criteria import Criterion, ridged
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.feasibility import Feasibility, PlanWalls
 from calib_planner.planning.information import InformationModel, Model
-from calib_planner.planning.search.apart import repelling
+from calib_planner.planning.problem import LARGE
+from calib_planner.planning.search.apart import APART, nearest, repelling
 from calib_planner.planning.search.descent import Descent, Objective, descend, wander
 from calib_planner.planning.search.interior import descend_inside
+from calib_planner.planning.search.swaps import DRAWN, swapped
 
 CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
@@ -53,7 +58,7 @@ PLAIN = Effort(80, 1e-4), Effort(200, 1e-7)
 """Of all starts of a part, and of its finalists."""
 INSIDE = Effort(20, 1e-3), Effort(60, 1e-5, (1e-4, 2e-6))
 """The same with constraints: the last pressure leaves 2e-6 of Ψ per active margin."""
-EXTENDED = Effort(40, 2e-3, (3e-2, 3e-3)), Effort(120, 1e-4, (3e-3, 1e-4))
+EXTENDED = Effort(100, 1e-4, (3e-3, 1e-4))
 """With a whole error model: its promise is not known to 0.01 %, and an evaluation takes ten times as long."""
 BATCH = 4_000_000
 """Numbers in the inverse Hessians of descents side by side: beyond that, moving them through memory takes longer
@@ -148,14 +153,17 @@ def search_chunk(
 ) -> SearchResult:
     """One part of the work: ``starts`` descents, the best of them."""
     size = problem.size
-    rows, used = _starts(problem, starts, rng, cancel)
-    extended = isinstance(problem.model, ExtendedModel)
-    first, last = efforts(problem)
-    rough = descend_from(problem, size, rows, cancel, first)
-    finalists = rough.x[np.argsort(rough.value)[: 1 if extended else FINALISTS]]
-    mean = mean_objective(problem, size) if problem.beside else None
-    final = descend_from(problem, size, finalists, cancel, last, objective=mean)
-    work = used + rough.evaluations + final.evaluations
+    if isinstance(problem.model, ExtendedModel):
+        plans, used = _swapped(problem, problem.model, starts, rng, cancel)
+        mean = mean_objective(problem, size)
+        final = descend_from(problem, size, plans, cancel, EXTENDED, objective=mean)
+        work = used + final.evaluations
+    else:
+        rows, used = _starts(problem, starts, rng, cancel)
+        first, last = efforts(problem)
+        rough = descend_from(problem, size, rows, cancel, first)
+        final = descend_from(problem, size, rough.x[np.argsort(rough.value)[:FINALISTS]], cancel, last)
+        work = used + rough.evaluations + final.evaluations
     if problem.feasibility.masks and isinstance(problem.model, InformationModel):
         final, more = _along_the_edge(problem, problem.model, final, rng, cancel)
         work += more
@@ -167,7 +175,7 @@ def search_chunk(
 def efforts(problem: SearchProblem) -> tuple[Effort, Effort]:
     """Of all starts of a part, and of its finalists."""
     if isinstance(problem.model, ExtendedModel):
-        return EXTENDED
+        return EXTENDED, EXTENDED
     return INSIDE if problem.feasibility.constraints else PLAIN
 
 
@@ -200,16 +208,14 @@ def _starts(
     """(rows, size, joints) starting plans, and plans evaluated on the way."""
     size, draw = problem.size, problem.feasibility.sample
     parts, evaluations = [], 0
-    extended = isinstance(problem.model, ExtendedModel)
-    rounded = -(-starts * (2 if extended else 1) // 3) if len(problem.support) else 0
+    rounded = -(-starts // 3) if len(problem.support) else 0
     if rounded:
         picks = rng.choice(len(problem.support), (rounded, size), p=problem.weights)
         parts.append(shake(problem, problem.support[picks], rng))
     # So many configurations are needed to identify everything without a prior.
     robot = problem.model.robot
     kernel_size = max(-(-len(robot.parameter_names) // (3 * len(robot.targets))), 1)
-    # Where equal configurations repeat their error, a small plan repeated is no good start.
-    tiled = -(-starts // 3) if kernel_size < size and not extended else 0
+    tiled = -(-starts // 3) if kernel_size < size else 0
     if tiled:
         first = draw(rng, tiled * kernel_size).reshape(tiled, -1)
         kernel = descend_from(problem, kernel_size, first, cancel, efforts(problem)[0])
@@ -217,10 +223,31 @@ def _starts(
         best = np.argsort(kernel.value)[: max(2, tiled // 4)]
         rows = np.resize(np.arange(kernel_size), size)
         parts.append(shake(problem, kernel.x[best].reshape(len(best), kernel_size, -1)[:, rows], rng))
-    random = max(starts - rounded - tiled, 0 if extended and rounded else 1)
-    if random:
-        parts.append(draw(rng, random * size).reshape(random, size, -1))
+    random = max(starts - rounded - tiled, 1)
+    parts.append(draw(rng, random * size).reshape(random, size, -1))
     return np.concatenate(parts), evaluations
+
+
+def _swapped(
+    problem: SearchProblem,
+    model: ExtendedModel,
+    starts: int,
+    rng: np.random.Generator,
+    cancel: Callable[[], bool],
+) -> tuple[FloatArray, int]:
+    """(starts, size, joints) plans from the approximate design after swaps, and swaps tried."""
+    heavy, plans, tried = problem.weights > 0, [], 0
+    # A large plan differs less from one size of the errors to the next, and each size costs as much as the first.
+    every = (problem, *problem.beside) if problem.size < LARGE else (problem,)
+    sizes = [(p.model, p.criterion, p.prior) for p in every if isinstance(p.model, ExtendedModel)]
+    support, weights = problem.support[heavy], problem.weights[heavy]
+    for _ in range(starts):
+        drawn = problem.feasibility.sample(rng, max(DRAWN // (3 * len(model.robot.targets)), problem.size))
+        plan, more = swapped(sizes, problem.size, support, weights, drawn, rng, cancel)
+        crowded = nearest(model.robot, plan) < APART
+        plans.append(shake(problem, plan[None], rng)[0] if crowded else plan)
+        tried += more
+    return np.stack(plans), tried
 
 
 def shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:
