@@ -432,6 +432,7 @@ def write_outputs(args: argparse.Namespace, problem: IdentificationProblem, esti
 
         inputs = [("robot", args.robot), *(("data", f) for f in args.data)]
         inputs += [("held out", f) for f in args.validate or ()]
+        inputs += [("cell", args.cell)] if args.cell else []
         command = shlex.join(["calib-planner", *sys.argv[1:]])
         source = provenance(inputs, command=command, seed=args.seed, estimate=args.output or "")
         write_report(args.report, problem, estimate, source, "--report")

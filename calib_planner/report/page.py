@@ -165,26 +165,19 @@ def ways_to_apply(report: CalibrationReport) -> list[tuple[str, str, str]]:
     robot = made.named("robot") or report.problem.robot.source or report.problem.robot.name
     learnt = len(report.estimate.knowledge.model.systematic) > 1
     without = " It holds placement alone: gravity and joint functions are not in it." if learnt else ""
-    if "identify" in made.command:
-        again = made.command
-    else:
-        data = made.named("data") or "points.csv"
-        again = f"calib-planner identify --robot {quote(robot)} --data {quote(data)} …"
+    export = f"calib-planner export {quote(made.estimate or 'estimate.yaml')}"
     ways = []
     if PurePath(robot).suffix.lower() in URDF_SUFFIXES:
         text = (
             "Your URDF with the identified origins of the joints, all else byte for byte: your robot_description."
         )
-        command = f"{again} --urdf-output calibrated.urdf"
+        command = f"{export} --urdf calibrated.urdf"
         ways.append(("A controller or planner that reads a URDF", text + without, command))
     text = "x, y, z, roll, pitch, yaw per joint and a hash, in the form of Universal Robots' description."
-    command = f"{again} --kinematics-output my_kinematics.yaml"
+    command = f"{export} --kinematics my_kinematics.yaml"
     ways.append(("Kinematics from xyz + rpy per joint", text + without, command))
     text = "Joint targets corrected one by one, so that the real tool goes where the nominal model says."
     if learnt:
         text += " With gravity and joint functions: this alone reaches the accuracy of the whole error model."
-    command = (
-        f"calib-planner compensate --robot {quote(robot)} --estimate {quote(made.estimate or 'estimate.yaml')} "
-        "--targets path.csv --output corrected.csv"
-    )
+    command = f"{export} --targets path.csv corrected.csv"
     return [*ways, ("A controller whose model cannot be changed", text, command)]
