@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test prove docs lint bench soak faults clean
+.PHONY: help setup demo test prove docs lint wheel bench soak faults clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -25,6 +25,9 @@ docs: setup ## make the documentation: build/docs/index.html (warnings are error
 
 lint: setup ## ruff and mypy
 	@. ./env.sh && ruff check . && ruff format --check . && mypy
+
+wheel: ## build the wheel; install and use it without ROS in every Python 3.10 … 3.13 that is there
+	@tools/wheel.sh
 
 bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (minutes; JSON to results/)
 	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot half_and_double minutes identification coverage streaming; do \
