@@ -105,7 +105,7 @@ def add(commands: Commands, summary: str) -> None:
     option(work, "--repetitions", "K", "number of measurements at each configuration (1)", kind=int)
     add_pace(parser)
     add_jobs(parser)
-    switch(parser, "--prove", "make the bound rigorous, by branch and bound")
+    switch(parser, "--prove", "prove the bound by branch and bound also where that takes longer")
     option(parser, "--output", "FILE", "write the plan: .yaml, or .csv for a table")
     option(parser, "--sheet", "DIR", "write the sheet for the person at the robot, see sheet")
 

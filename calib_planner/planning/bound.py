@@ -455,6 +455,7 @@ def _extended_design(
         drawn = candidates[rng.permutation(len(candidates))]
     else:
         drawn = np.concatenate([start, feasibility.sample(rng, SPREAD)])
+    every = model.linearised(drawn if candidates is None else candidates)
     everywhere = model.at(drawn[-SPREAD:]).mean(axis=0)
     support: FloatArray = drawn[:LARGEST_SUPPORT]
     weights: FloatArray = np.full(len(support), 1.0 / len(support))
@@ -477,8 +478,12 @@ def _extended_design(
         )
         lifted = replace(problem, model=seen.model)
         if candidates is not None:
-            jobs = [(seen.model, gradient, part) for part in cut(candidates)]
-            where, heights = candidates, np.concatenate(results_of(executor, _heights, jobs))
+            where, jobs = candidates, [(seen.model, gradient, part) for part in cut(candidates)]
+            if len(jobs) == 1:
+                rows = every.as_seen_by(seen.model).whitened
+                heights = np.sum((rows @ gradient) * rows, axis=(1, 2))
+            else:
+                heights = np.concatenate(results_of(executor, _heights, jobs))
         else:
             peaks = maximise_sensitivity(lifted, gradient, _probes(lifted, gradient, support, weights, rng))
             where, heights = peaks.x, np.exp(-peaks.value)
@@ -509,24 +514,34 @@ def _reweighted_together(
         The weights, M (p, p), the configurations in the model seen from there, and Σ_l Θ_lᵀΘ_l (p, p).
     """
 
-    def at(w: FloatArray) -> tuple[float, FloatArray, FloatArray, LinearisedExtension, FloatArray]:
-        seen, extra = info.seen_from(mass * np.maximum(w, 1e-9))
-        rows = seen.whitened
-        matrix = ground + extra + mass * np.tensordot(rows * w[:, None, None], rows, axes=([0, 1], [0, 1]))
-        psi, gradient = (part[0] for part in criterion.value_and_gradient(matrix[None]))
-        heights = np.maximum(np.sum((rows @ gradient) * rows, axis=(1, 2)), 1e-300)
-        return float(psi), matrix, heights, seen, extra
+    n, rows, p = info.jacobian.shape
+    columns, every = info.stacked(n)[0], np.arange(n)
+    own = info.as_seen_by(replace(info.model, coupled=False)).covariance(1)
+    whitener = np.linalg.inv(np.linalg.cholesky(own))
+    together = info.covariance(n)[0].reshape(n, rows, n, rows)
+    together[every, :, every, :] -= own
+    shared = together.reshape(n * rows, n * rows)
 
-    psi, matrix, heights, seen, extra = at(w)
+    def at(w: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        covariance = together.copy()
+        covariance[every, :, every, :] += own / (mass * np.maximum(w, 1e-9))[:, None, None]
+        solved = np.linalg.solve(covariance.reshape(shared.shape), columns)
+        matrix = ground + columns.T @ solved
+        psi, gradient = (part[0] for part in criterion.value_and_gradient(matrix[None]))
+        seen = whitener @ (columns - shared @ solved).reshape(n, rows, p)
+        heights = np.sum((seen.reshape(n * rows, p) @ gradient).reshape(seen.shape) * seen, axis=(1, 2))
+        return float(psi), matrix, np.maximum(heights, 1e-300)
+
+    psi, matrix, heights = at(w)
     exponent = 0.7
     for _ in range(UPDATES):
         trial = _normalised(w * (heights / (w @ heights)) ** exponent)
         moved = at(trial)
         if moved[0] >= psi * (1.0 - 1e-12):
-            w, (psi, matrix, heights, seen, extra) = trial, moved
+            w, (psi, matrix, heights) = trial, moved
         else:
             exponent *= 0.5
-    return w, matrix, seen, extra
+    return w, matrix, *info.seen_from(mass * np.maximum(w, 1e-9))
 
 
 # ── among candidates ─────────────────────────────────────────────────────────────────────────────────

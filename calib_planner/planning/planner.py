@@ -438,7 +438,7 @@ def _choice(
     """The choice among ``candidates`` (C, joints), all of them feasible."""
     together = space.model.linearised(candidates) if isinstance(space.model, ExtendedModel) else None
     return ChoiceProblem(
-        rows=space.model.whitened(candidates),
+        rows=space.model.whitened(candidates) if together is None else together.whitened,
         criterion=criterion,
         prior=space.prior,
         size=space.problem.configurations,

@@ -32,7 +32,6 @@ from calib_planner.planning.bound import (
     DesignProblem,
     approximate_design,
     continued,
-    heights_of,
 )
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, sensitivity, square_root
@@ -148,7 +147,7 @@ def prove_bound(
         The design with the smallest proven bound, and its proof; the design unchanged if nothing is proven.
     """
     if problem.candidates is not None:
-        return design, _prove_candidates(problem, problem.candidates, design)
+        return design, _prove_candidates(problem, design)
     deadline = time.perf_counter() + time_limit
     free = replace(problem, feasibility=replace(problem.feasibility, constraints=()))
     bounded, tried = bool(problem.feasibility.constraints), design
@@ -245,12 +244,12 @@ def prove_maximum(
     )
 
 
-def _prove_candidates(problem: DesignProblem, candidates: FloatArray, design: ApproximateDesign) -> Proof:
-    """Over candidates (C, joints), with any model: every d is computed, the bound is exact already."""
-    q = candidates[problem.feasibility.mask(candidates)]
-    d = heights_of(design, q)
-    best = int(np.argmax(d))
-    return Proof(float(d[best]), float(d[best]), q[best], design.gradient, 1.0, len(q), (), 0.0, "candidates")
+def _prove_candidates(problem: DesignProblem, design: ApproximateDesign) -> Proof:
+    """Over candidates, with any model: every d was computed, the bound is exact already."""
+    assert problem.candidates is not None
+    top = (design.bound - design.ground) / problem.visits
+    where = design.support[int(np.argmax(design.weights))]
+    return Proof(top, top, where, design.gradient, 1.0, len(problem.candidates), (), 0.0, "candidates")
 
 
 def _obstacle(model: Model) -> str:

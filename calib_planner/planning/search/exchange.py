@@ -451,7 +451,7 @@ class _Chosen:
         left = shared.columns[new] * shared.scales(factor) - (weights @ self.columns).reshape(len(new), r, -1)
         met = weights.reshape(len(new), r, -1) @ np.swapaxes(cross.reshape(len(new), r, -1), 1, 2)
         alone = shared.points[new] + factor**2 * (shared.visits[new] + shared.own[new]) - met
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(alone), left))
+        return np.linalg.inv(np.linalg.cholesky(alone)) @ left
 
     def with_one_more(self, new: IntArray, position: int) -> FloatArray:
         """log Ψ (K,) with each of ``new`` (K,) in the place of the row at ``position``.
@@ -468,9 +468,10 @@ class _Chosen:
             return log_values_of(self.problem, left + np.swapaxes(added, 1, 2) @ added)
         seen = gone @ self.hidden
         inverse = self.hidden + seen.T @ np.linalg.solve(own - seen @ gone.T, seen)
-        half = added @ inverse
+        half = (added.reshape(-1, len(inverse)) @ inverse).reshape(added.shape)
         inner = np.eye(self.r) + half @ np.swapaxes(added, 1, 2)
-        gained = np.linalg.solve(inner, half @ criterion.weight @ np.swapaxes(half, 1, 2))
+        turned = (half.reshape(-1, len(inverse)) @ criterion.weight).reshape(added.shape)
+        gained = np.linalg.solve(inner, turned @ np.swapaxes(half, 1, 2))
         rest = np.sum(criterion.weight * inverse) - np.einsum("kii->k", gained)
         return np.where(rest > 0.0, -np.log(np.maximum(rest, 1e-300)), -np.inf)
 
@@ -542,11 +543,12 @@ class _Together:
         chosen = [_Chosen(p, self.shared, rows) for p in every]
         log_value, tried = float(np.mean([log_values_of(c.problem, c.matrix[None])[0] for c in chosen])), 1
         for _ in range(MOST_PASSES):
-            improved, gains = False, self._seen(chosen[0])
+            improved, order = False, self._order(self._seen(chosen[0]))
             for position in range(self.problem.size):
                 if cancel():
                     return tried
-                shortlist = self._best(gains, rows)
+                shortlist = order if self.problem.repeat else order[~np.isin(order, rows)]
+                shortlist = shortlist[:SHORTLIST]
                 if not len(shortlist):
                     continue
                 trial = np.mean([c.with_one_more(shortlist, position) for c in chosen], axis=0)
@@ -567,7 +569,8 @@ class _Together:
             self.shared.put(position, row)
         while len(rows) < self.problem.size:
             chosen = _Chosen(self.problem, self.shared, rows)
-            row = int(self._best(self._gains(chosen, chosen.matrix + ground, given=True), rows)[0])
+            order = self._order(self._gains(chosen, chosen.matrix + ground, given=True))
+            row = int((order if self.problem.repeat else order[~np.isin(order, rows)])[0])
             self.shared.put(len(rows), row)
             rows = np.append(rows, row)
         return rows
@@ -598,10 +601,9 @@ class _Together:
         values, vectors = np.linalg.eigh(gradient)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
-    def _best(self, gains: FloatArray, taken: IntArray) -> IntArray:
-        """Candidates of largest gain, largest first; not those taken where each may be used once."""
+    def _order(self, gains: FloatArray) -> IntArray:
+        """The candidates of largest gain, largest first, with as many more as may be taken already."""
+        count = min(SHORTLIST + self.problem.size, len(gains))
         gains = np.where(np.isfinite(gains), gains, 0.0)
-        if not self.problem.repeat:
-            gains[taken] = -np.inf
-        order = np.argsort(-gains, kind="stable")[:SHORTLIST]
-        return order[np.isfinite(gains[order])]
+        largest = np.argpartition(-gains, count - 1)[:count]
+        return largest[np.argsort(-gains[largest], kind="stable")]
