@@ -63,6 +63,8 @@ Example: calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
     command = next((w for w in words if w in COMMANDS), "")
     try:
         args = parse(words, command)

@@ -19,6 +19,10 @@ KINDS = {"int": "a whole number", "float": "a number"}
 """Type of a value → the words for it."""
 
 
+ALIKE = 0.7
+"""Share of equal letters from which a word is a mistyped one: two exchanged letters of four are 0.75."""
+
+
 class UsageError(InputError):
     """A command line that cannot be understood."""
 
@@ -65,10 +69,11 @@ def _read(message: str, where: str) -> UsageError:
 
 def suggestion(word: str, valid: Iterable[str]) -> str:
     """What was probably meant, as advice; empty where nothing is near."""
-    names = list(valid)
-    longer = [n for n in names if len(word) > 3 and n.startswith(word)]
-    close = get_close_matches(word, names, n=1) or longer[:1]
-    return f"did you mean {close[0]}?" if close else ""
+    names, bare = list(valid), word.lstrip("-")
+    longer = [n for n in names if len(bare) > 3 and n.startswith(word)]
+    close = get_close_matches(bare, [n.lstrip("-") for n in names], n=1, cutoff=ALIKE)
+    near = longer[:1] or [n for n in names if n.lstrip("-") in close][:1]
+    return f"did you mean {near[0]}?" if near else ""
 
 
 def with_cell(top: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:

@@ -150,6 +150,13 @@ def test_help_has_units_and_an_example(command: str, capsys: pytest.CaptureFixtu
         assert "[m]" in out
 
 
+def test_help_as_a_word(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, like in ((["help"], ["--help"]), (["help", "robots", "show"], ["robots", "show", "--help"])):
+        assert main(words) == 0
+        shown = capsys.readouterr().out
+        assert main(like) == 0 and capsys.readouterr().out == shown != ""
+
+
 def test_version_and_module_with_closed_pipe(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0 and __version__ in capsys.readouterr().out
     run = [sys.executable, "-m", "calib_planner", "robots", "list"]
