@@ -363,7 +363,7 @@ def maximise_sensitivity(problem: DesignProblem, gradient: FloatArray, starts: F
     if not feasibility.constraints:
         return descend(objective, starts, low, high, iterations=iterations, tolerance=tolerance)
     return descend_inside(
-        objective, PlanWalls(feasibility, 1), starts, low, high, iterations=20, tolerance=1e-3, pressures=EDGE
+        objective, PlanWalls(feasibility, 1), starts, low, high, iterations=12, tolerance=1e-3, pressures=EDGE
     )
 
 

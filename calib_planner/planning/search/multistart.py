@@ -56,7 +56,7 @@ class Effort:
 
 PLAIN = Effort(80, 1e-4), Effort(200, 1e-7)
 """Of all starts of a part, and of its finalists."""
-INSIDE = Effort(20, 1e-3), Effort(60, 1e-5, (1e-4, 2e-6))
+INSIDE = Effort(16, 1e-3), Effort(60, 1e-5, (1e-4, 2e-6))
 """The same with constraints: the last pressure leaves 2e-6 of Ψ per active margin."""
 EXTENDED = Effort(100, 1e-4, (3e-3, 1e-4))
 """With a whole error model: its promise is not known to 0.01 %, and an evaluation takes ten times as long."""
