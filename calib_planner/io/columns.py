@@ -245,6 +245,8 @@ def _joint_places(
 ) -> tuple[list[int], bool]:
     """Column of each joint, and whether the joints are called by their numbers."""
     exact = {n: j for j, n in enumerate(names)}
+    # Where a column has the name itself, one with a unit behind it (``q1_deg`` of a plan sheet) is for people.
+    exact |= {n: j for j, n in enumerate(table.columns) if n in joint_names}
     if all(n in exact for n in joint_names):
         return [exact[n] for n in joint_names], False
     alike: dict[str, list[int]] = {}
