@@ -41,9 +41,9 @@ EXAMPLE = """calib-planner export estimate.yaml --urdf calibrated.urdf --report 
   calib-planner export estimate.yaml --degrees --targets path.csv corrected.csv"""
 DESCRIPTION = """Write what controllers, planners and people need of an estimate, as often as wanted.
 
-The file that identify --output wrote holds the measurements and the robot's file, so that nothing else is needed
+The file that identify writes holds the measurements and the robot's file, so that nothing else is needed
 and nothing is fitted again. Files of older versions need the robot (--robot) and give no report. Without options
-the estimate is shown; --json prints it as identify --json does."""
+the estimate is shown; --json prints it as identify does."""
 PAGE = "calibration.html"
 """Name of the report in a folder."""
 
@@ -51,7 +51,7 @@ PAGE = "calibration.html"
 def add(commands: Commands, summary: str) -> None:
     """Add the command's parser."""
     parser = add_command(commands, "export", summary, run, EXAMPLE, DESCRIPTION)
-    parser.add_argument("estimate", metavar="ESTIMATE", help="estimate, written by identify --output")
+    parser.add_argument("estimate", metavar="ESTIMATE", help="estimate file, as identify writes it")
     add_robot(parser, "the one in the estimate", targets=False)
     add_reading(parser)
     what = parser.add_argument_group("what to write")
