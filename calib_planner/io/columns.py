@@ -192,7 +192,13 @@ class _Wanted:
 def _by_name(table: Table, wanted: _Wanted) -> Meaning:
     joint_names, points, joints = wanted.joint_names, wanted.points, wanted.joints
     columns = [Column()] * len(table.columns)
-    named = [(n, "") if n in joint_names or COORDINATE.fullmatch(n) else unit_of(n) for n in table.columns]
+    written = set(table.columns)
+    named = []
+    for column in table.columns:
+        name, unit = unit_of(column)
+        # What stands there without a unit, too, is the column meant; joints may be called as if they had a unit.
+        alone = column in joint_names or COORDINATE.fullmatch(column) or (unit and name in written)
+        named.append((column, "") if alone else (name, unit))
     for name, unit in named:
         _refuse_strange_unit(table, name, unit, joint_names)
     place, by_number = _joint_places(table, [n for n, _ in named], joint_names, needed=joints)
@@ -245,8 +251,12 @@ def _joint_places(
 ) -> tuple[list[int], bool]:
     """Column of each joint, and whether the joints are called by their numbers."""
     exact = {n: j for j, n in enumerate(names)}
-    # Where a column has the name itself, one with a unit behind it (``q1_deg`` of a plan sheet) is for people.
-    exact |= {n: j for j, n in enumerate(table.columns) if n in joint_names}
+    for joint in joint_names:
+        twins = [table.columns[j] for j, n in enumerate(names) if n == joint]
+        if len(twins) > 1:
+            raise FileFormatError(
+                table.path, "header", listed(twins), f"one column of {joint}", "state --columns"
+            )
     if all(n in exact for n in joint_names):
         return [exact[n] for n in joint_names], False
     alike: dict[str, list[int]] = {}

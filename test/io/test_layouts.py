@@ -155,6 +155,11 @@ REFUSED: dict[str, tuple[str | bytes, dict, list[str]]] = {
         {},
         ["X, measured X", "one column of x per reflector"],
     ),
+    "a joint in two units": (
+        HEAD.replace("j1", "j1 [rad],j1 [deg]") + "0.1," + ROW,
+        {},
+        ["j1 [rad], j1 [deg]", "one column of j1", "state --columns"],
+    ),
     "unknown unit": (HEAD.replace("x1", "x1 [Zoll]") + ROW, {}, ["x1 [Zoll]", "'Zoll'", "state --columns"]),
     "angle of a length": (HEAD.replace("x1", "x1 [deg]") + ROW, {}, ["x1 [deg]", "a unit of length"]),
     "length of an angle": (HEAD.replace("j1", "j1 [mm]") + ROW, {}, ["column j1", "a unit of angle", "mm"]),
@@ -268,6 +273,14 @@ def test_configurations_are_read_in_any_layout_and_go_out_in_their_units(tmp_pat
     assert names[0] == "j1 [deg]"
     (tmp_path / "out.csv").write_text(format_table(names, again.tolist()))
     np.testing.assert_allclose(read_joints(tmp_path / "out.csv", ROBOT).configurations, DATA.q, atol=1e-15)
+
+
+def test_a_column_without_unit_wins_over_its_twins(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text("j1_deg," + HEAD.strip() + ",x1_mm\n7," + ROW.strip() + ",9\n")
+    source = read_data(path, ROBOT)
+    assert source.data.q[0].tolist() == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    assert source.data.p[0, 0].tolist() == [1.5, 0.25, 1e-3] and source.ignored == ("j1_deg", "x1_mm")
 
 
 def test_the_line_that_is_said(tmp_path: Path) -> None:
