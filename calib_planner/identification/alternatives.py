@@ -1257,7 +1257,7 @@ class _Gross:
                 for sign, word in ((1.0, "+"), (-1.0, "−")):
                     both = _with_column(q, j, q[:, j] + sign * q[:, k])
                     pair = {"joint": names[j], "beside": names[k]}
-                    words = {"size": word, "option": Coupling(names[j], names[k], -sign)}
+                    words = {"size": word, "option": str(Coupling(names[j], names[k], -sign))}
                     yield self._change("couple", both, p, words=words, size=sign, unit="1", **pair)
         for j, k in combinations(range(len(names)), 2):
             if self.turns[j] == self.turns[k]:

@@ -83,7 +83,7 @@ def expanded(path: Path, arguments: dict[str, str]) -> str:
         from xacro import substitution_args
     except ImportError:
         raise FileFormatError(path, "document", "a xacro file", "plain URDF", ADVICE) from None
-    known, words = substitution_args._eval_find, substitution_args._eval_dict
+    known, words = substitution_args._eval_find, getattr(substitution_args, "_eval_dict", {})
 
     def find(package: str) -> str:
         """What ``$(find PACKAGE)`` stands for; xacro itself asks ROS alone."""
