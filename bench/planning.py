@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_planner import PlanProblem, Robot, plan
+from calib_planner.error_model import gravity_of, typical
 from calib_planner.planning import (
     Constraint,
     InformationModel,
@@ -40,7 +41,7 @@ def efficiencies(robot: Robot, poses: np.ndarray) -> list[dict[str, float]]:
     rows = []
     for m, wanted in TARGETS.items():
         plans = [plan(PlanProblem(robot, pose, m)) for pose in poses]
-        e, t = (np.array([getattr(p, name) for p in plans]) for name in ("efficiency", "seconds"))
+        e, t = (np.array([getattr(p.quality, name) for p in plans]) for name in ("efficiency", "seconds"))
         row = {
             "configurations": m, "wanted": wanted, "poses": len(poses),
             "median": float(np.median(e)), "worst": float(e.min()), "below": int((e < wanted).sum()),
@@ -53,6 +54,27 @@ def efficiencies(robot: Robot, poses: np.ndarray) -> list[dict[str, float]]:
             f"{row['seconds_worst']:.2f} s worst",
             file=sys.stderr,
         )
+    return rows
+
+
+def with_error_model() -> list[dict[str, float | str]]:
+    """Processor time of plans for real robots: all parameters, base and tool unknown, typical errors."""
+    rows: list[dict[str, float | str]] = []
+    for name in ("kuka_kr270", "ur10e"):
+        robot = Robot.load(name).with_parameters("full", ("base", "tool"))
+        low, high = 0.6 * robot.joint_limits.T
+        model = typical(gravity=gravity_of(robot))
+        for m in (12, 30):
+            times, accuracies = [], []
+            for seed in range(5):
+                pose = np.random.default_rng(100 + seed).uniform(low, high)
+                began = time.process_time()
+                found = plan(PlanProblem(robot, pose, m, error_model=model, search=Search(seed=seed)))
+                times.append(time.process_time() - began)
+                accuracies.append(1e6 * found.quality.predicted_accuracy)
+            row = {"robot": name, "configurations": m, "seconds_median": float(np.median(times))}
+            rows.append(row | {"accuracy_mean_um": float(np.mean(accuracies))})
+            print(f"error model, {name}, m = {m}: {row['seconds_median']:.2f} s median", file=sys.stderr)
     return rows
 
 
@@ -153,7 +175,8 @@ def main() -> None:
     low, high = robot.joint_limits.T
     poses = np.random.default_rng(2026).uniform(low, high, (args.poses, 6))
     result = {
-        "efficiency": efficiencies(robot, poses), "constrained": constrained(robot, 5), "scaling": scaling(robot),
+        "efficiency": efficiencies(robot, poses), "error_model": with_error_model(),
+        "constrained": constrained(robot, 5), "scaling": scaling(robot),
     }  # fmt: skip
     print(json.dumps(result))
 

@@ -340,6 +340,10 @@ class Robot(Told):
     # ── inside: arrays are clean from here on ────────────────────────────────────────────────────────
 
     def _check_q(self, q: ArrayLike) -> FloatArray:
+        # Nothing here keeps or changes configurations: an array that is right already needs no copy.
+        right = type(q) is np.ndarray and q.dtype == np.float64 and q.shape[1:] == (len(self.joint_names),)
+        if right and np.isfinite(q).all():
+            return np.asarray(q)
         return check_configurations("configurations", q, self.joint_names)
 
     def _check_deviations(self, deviations: ArrayLike | None) -> FloatArray | None:

@@ -34,6 +34,7 @@ that one program serves a whole identification.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -378,14 +379,14 @@ class Program:
     def code(self) -> NDArray[np.int32]:
         """The program as numbers for ``kernel.c``, whose ``unpack`` has the layout."""
         scalar = [(_SCALARS.index(op), a, b, node) for op, a, b, node in self.scalars]
-        vector = [(_VECTORS.index(ufunc), a, b, slot) for ufunc, a, b, slot in self.vectors]
-        parts = (scalar, vector, self.turns, self.joints, self.constants, self.copies, self.registers)
+        vector, registers, scratch = _fused(self)
+        parts = (scalar, vector, self.turns, self.joints, self.constants, self.copies, registers)
         counts = [len(part) for part in parts]
         joints = 1 + max([j for _, j in self.joints] + [t[0] for t in self.turns], default=-1)
         nodes = 1 + max([0, *(s[3] for s in self.scalars)])
         head = [*counts[:3], joints, *counts[3:6], self.slots, self.rows, counts[6]]
         flat = [number for part in parts for entry in part for number in entry]
-        return np.array([*head, self.scratch, nodes, *flat], np.int32)
+        return np.array([*head, scratch, nodes, *flat], np.int32)
 
     def _turn(self, q: NDArray[Any], numbers: dict[int, Any], angles: NDArray[Any], waves: NDArray[Any]) -> None:
         """Cosines and sines of the joint angles of one block, (turns, n), into ``waves`` (2, turns, n)."""
@@ -432,6 +433,58 @@ _SCALARS = ("amount", "cos", "sin", "mul", "add", "sub")
 _VECTORS = (np.multiply, np.add, np.subtract)
 """Operations in the order in which ``kernel.c`` numbers them."""
 _UFUNCS: dict[str, Callable[..., Any]] = {"mul": np.multiply, "add": np.add, "sub": np.subtract}
+
+
+def _fused(program: Program) -> tuple[list[tuple[int, ...]], list[tuple[int, int]], int]:
+    """The vector operations with products taken into the sum that alone needs them.
+
+    Returns:
+        ``(operation, a, b, c, d, slot)``, operations numbered as in ``kernel.c``: a·b, a + b, a − b, a·b + c·d,
+        a·b − c·d, a·b + c, a·b − c, c − a·b; then registers and their number as in ``Program``.
+    """
+    uses = Counter(slot for _, a, b, _ in program.vectors for slot in (a, b))
+    uses.update(slot for _, _, slot in program.copies)
+    products = {
+        slot: (a, b)
+        for ufunc, a, b, slot in program.vectors
+        if ufunc is np.multiply and slot >= program.rows and uses[slot] == 1
+    }
+    sums = [(a, b) for ufunc, a, b, _ in program.vectors if ufunc is not np.multiply]
+    taken = {slot for pair in sums for slot in pair if slot in products}
+    result: list[tuple[int, ...]] = []
+    for ufunc, a, b, slot in program.vectors:
+        number, plus = _VECTORS.index(ufunc), ufunc is np.add
+        if slot in taken:
+            continue
+        left, right = (products.get(s) if s in taken and number else None for s in (a, b))
+        if left and right:
+            result.append((3 if plus else 4, *left, *right, slot))
+        elif left:
+            result.append((5 if plus else 6, *left, b, b, slot))
+        elif right:
+            result.append((5 if plus else 7, *right, a, a, slot))
+        else:
+            result.append((number, a, b, a, a, slot))
+    return result, *_registers(result, {slot for slot, _ in program.registers}, program)
+
+
+def _registers(
+    vectors: list[tuple[int, ...]], slots: set[int], program: Program
+) -> tuple[list[tuple[int, int]], int]:
+    """``(slot, register)`` of those ``slots`` that ``vectors`` make, and how many registers there are."""
+    last = {slot: step for step, (_, *operands, _) in enumerate(vectors) for slot in operands}
+    last.update({slot: len(vectors) for _, _, slot in program.copies})
+    free: list[int] = []
+    place: dict[int, int] = {}
+    used = 0
+    for step, (_, *operands, slot) in enumerate(vectors):
+        if slot in slots:
+            place[slot] = free.pop() if free else used
+            used = max(used, place[slot] + 1)
+        for operand in set(operands):
+            if operand in place and last[operand] == step:
+                free.append(place[operand])
+    return list(place.items()), used
 
 
 def _lay_out(tracer: Tracer, outputs: list[Ref], shape: tuple[int, int, int]) -> Program:
