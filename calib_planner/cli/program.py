@@ -85,7 +85,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         "format": form.name,
         "title": form.title,
         "name": program_name(sheet, form, settings),
-        "plan": sheet.identity,
+        "id": sheet.identity,
         "visits": len(axes),
         "measurements": plan.measurements,
         "axes": axes,

@@ -388,7 +388,7 @@ def _others() -> list[Case]:
             "init --robot kuka_kr270 --data kuka_points.csv --sigma 20um --mounting ceiling",
             ("cell.yaml",),
         ),
-        Case("program", "program kuka_plan.yaml --for fanuc --signs '-1 1 1 1 1 -1' --output p.ls"),
+        Case("program", "program kuka_plan.yaml --for fanuc --name Visits --signs '-1 1 1 1 1 -1' --output p.ls"),
         Case("robots", "robots list"),
         *(Case(f"robots_{r}", f"robots show {r}") for r in ("planar_2r", "kuka_kr270", "ur10e", "arm.urdf")),
         Case(
