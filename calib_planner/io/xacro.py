@@ -6,7 +6,8 @@ xacro is the macro language in which most descriptions of robots are written. Th
     ur.urdf.xacro ur_type:=ur10e name:=ur
 
 ``$(find PACKAGE)`` means a package of ROS. Where ROS does not know the package, it is looked for as a folder with
-a ``package.xml`` around the file: beside it, beside the folders above it, and one level below those.
+a ``package.xml`` around the file: beside it, beside the folders above it, and one level below those; there also
+within other folders, as repositories of one workspace have it, if it has the package's name.
 
 A file with leftovers of xacro beside its chain is a URDF like any other and is read as it stands. Expanding runs
 the expressions of the file. xacro allows them no built-in functions of Python, but a file from a stranger is best
@@ -90,7 +91,7 @@ def expanded(path: Path, arguments: dict[str, str]) -> str:
         try:
             return str(known(package))
         except Exception:  # ROS is not there (ImportError), or has no such package (its own KeyError)
-            folder = next((f for f in _around(path) if _package(f) == package), None)
+            folder = next((f for f in _around(path, package) if _package(f) == package), None)
             if folder is None:
                 where, advice = f"$(find {package})", "put the folder of this package beside that of the file"
                 raise FileFormatError(path, where, "no such package", "a package", advice) from None
@@ -117,7 +118,7 @@ def _is_macro(item: ElementTree.Element) -> bool:
     return str(item.tag).startswith("xacro:") or any(EXPRESSION.search(v) for v in item.attrib.values())
 
 
-def _around(path: Path) -> Iterator[Path]:
+def _around(path: Path, package: str) -> Iterator[Path]:
     """Folders around a file that may be packages, the nearest first."""
     for above in list(path.resolve().parents)[:LEVELS]:
         yield above
@@ -126,6 +127,7 @@ def _around(path: Path) -> Iterator[Path]:
         except OSError:
             continue
         yield from inside
+        yield from (folder / package for folder in inside)
 
 
 def _package(folder: Path) -> str:

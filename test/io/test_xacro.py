@@ -51,6 +51,15 @@ def test_a_file_that_includes_another_package_is_expanded(cell):
     np.testing.assert_allclose(robot.positions(np.zeros(2))[0, 0], [0.5, 0, 0.4], atol=1e-15)
 
 
+def test_packages_of_another_repository_of_the_workspace(cell, tmp_path):
+    pytest.importorskip("xacro")
+    for name, repository in (("my_arm", "arms"), ("my_cell", "cells")):
+        (tmp_path / "src" / repository).mkdir()
+        (tmp_path / "src" / name).rename(tmp_path / "src" / repository / name)
+    path = tmp_path / "src" / "cells" / "my_cell" / "urdf" / cell.name
+    assert Robot.load(path).joint_names == ("left_j1", "left_j2")
+
+
 def test_arguments_follow_the_name_and_go_into_the_calibrated_urdf(cell, tmp_path, capsys):
     pytest.importorskip("xacro")
     name = f"{cell} length:=0.75"
