@@ -37,7 +37,7 @@ from calib_planner.planning.extended import UNCERTAIN, ExtendedModel
 from calib_planner.planning.information import spread_spaces
 from calib_planner.planning.planner import _design_problem, value_of
 from calib_planner.planning.search.apart import APART, nearest, repelling
-from calib_planner.planning.search.exchange import ChoiceProblem, _information, choose
+from calib_planner.planning.search.exchange import ChoiceProblem, _Chosen, _information, _Shared, choose
 from calib_planner.robot import Coupling
 from calib_planner.tracker import Isotropic, LaserTracker
 
@@ -268,6 +268,26 @@ def test_visits_that_are_near_push_each_other_away() -> None:
     np.testing.assert_allclose(gradient, np.transpose(differences), rtol=1e-6, atol=1e-6)
     far = np.concatenate([q, q + 1.0])[:, :1].reshape(1, 4, 6) + np.arange(4)[:, None]
     assert cost(far.reshape(1, -1))[0] == 0.0 and nearest(robot, far)[0] > APART
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0])
+def test_a_trial_exchange_has_the_value_that_the_whole_choice_has(factor: float) -> None:
+    """Downdates of the inverse, (3) of ``exchange``, against the information of each choice by definition."""
+    robot = kuka()
+    q = random_configurations(robot, 12, 5)
+    space = plan_space(PlanProblem(robot, POSE, 5, error_model=typical(Isotropic(3e-5)), search=FEW))
+    assert isinstance(space.model, ExtendedModel)
+    info = space.model.linearised(q)
+    request = ChoiceProblem(info.whitened, space.search_criterion(), space.prior, 5, together=info, factor=factor)
+    rows, new = np.array([1, 4, 7, 8, 10]), np.array([0, 3, 11])
+    shared = _Shared(info, 5)
+    for position, row in enumerate(rows):
+        shared.put(position, row)
+    got = _Chosen(request, shared, rows).with_one_more(new, 2)
+    for value, row in zip(got, new, strict=True):
+        changed = np.where(np.arange(5) == 2, row, rows)
+        matrix = space.model.scaled(factor).totals(q[changed], 5)[0]
+        assert value == pytest.approx(np.log(request.criterion.exact(matrix + space.prior)), abs=1e-7)
 
 
 def test_candidates_are_exchanged_until_no_other_is_better() -> None:
