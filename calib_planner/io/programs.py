@@ -34,7 +34,8 @@ a comment or a string. Templates run in Jinja2's sandbox.
     axis = s · joint + z,    then    axis 3 ← axis 3 + c · axis 2.
 
 The coupling is −1 where a controller counts axis 3 from the horizontal, because the forearm keeps its inclination
-while axis 2 moves (FANUC). Values of sliding joints are in m under ``radians`` and in mm under ``degrees``.
+while axis 2 moves (FANUC). A robot with couplings of its own (``--couple``) is planned in the controller's
+coordinates; for it the template's coupling is not used. Values of sliding joints are in m under ``radians`` and in mm under ``degrees``.
 """
 
 from __future__ import annotations
@@ -248,7 +249,8 @@ def controller_axes(sheet: PlanSheet, form: ProgramFormat, settings: ProgramSett
     zeros = check_array("zeros", np.zeros(count) if settings.zeros is None else settings.zeros, (count,))
     if not (np.abs(signs) == 1.0).all():
         raise InputError("signs", signs.tolist(), "1 or -1 for every joint")
-    coupling = form.coupling if settings.coupling is None else check_number("coupling", settings.coupling)
+    usual = 0.0 if sheet.robot.couplings else form.coupling  # its coordinates are the controller's already
+    coupling = usual if settings.coupling is None else check_number("coupling", settings.coupling)
     axes = np.array(signs * q + zeros)
     if coupling and count < 3:
         raise InputError("coupling", coupling, f"0 for a robot of {count} joints")

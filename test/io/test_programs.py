@@ -23,6 +23,7 @@ from calib_planner.io import (
     read_program_format,
 )
 from calib_planner.planning import JointRange, PlanSheet, plan_sheet
+from calib_planner.robot import parse_coupling
 
 CLOSE = 1e-9
 """How near the values have to come back [rad]."""
@@ -268,6 +269,14 @@ def test_signs_zeros_and_coupling() -> None:
     np.testing.assert_array_equal(axes[:, 2], q[:, 2] - q[:, 1])
     alone = controller_axes(sheet, form, ProgramSettings(coupling=0))
     np.testing.assert_array_equal(alone, sheet.plan.configurations)
+
+
+def test_a_robot_that_shows_its_coupling_is_not_coupled_again() -> None:
+    coupled = KUKA.with_couplings([parse_coupling("joint_a3-=joint_a2")])
+    sheet, form = kuka_sheet(coupled), read_program_format("fanuc")
+    np.testing.assert_array_equal(controller_axes(sheet, form, ProgramSettings()), sheet.plan.configurations)
+    again = controller_axes(sheet, form, ProgramSettings(coupling=-1.0))
+    assert not np.array_equal(again, sheet.plan.configurations)
 
 
 def test_the_coupling_keeps_the_forearms_inclination() -> None:
