@@ -35,7 +35,8 @@ a comment or a string. Templates run in Jinja2's sandbox.
 
 The coupling is −1 where a controller counts axis 3 from the horizontal, because the forearm keeps its inclination
 while axis 2 moves (FANUC). A robot with couplings of its own (``--couple``) is planned in the controller's
-coordinates; for it the template's coupling is not used. Values of sliding joints are in m under ``radians`` and in mm under ``degrees``.
+coordinates; for it the template's coupling is not used. Values of sliding joints are in m under ``radians`` and
+in mm under ``degrees``.
 """
 
 from __future__ import annotations
