@@ -29,7 +29,7 @@ setup(
     name=NAME,
     version="0.1.0",
     description="Plans robot calibration measurements and identifies geometrical parameters",
-    long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
+    long_description=(Path(__file__).resolve().parent / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     keywords=["robot calibration", "laser tracker", "optimal experimental design", "ROS 2", "URDF"],
     classifiers=[
