@@ -16,15 +16,19 @@ comment that says what the controller takes, as YAML between ``{#---`` and ``---
 What follows is the program. It may use
 
     name, robot, plan            names of program and robot, identity of the plan
-    visits                       of each visit: number, repetitions, radians, degrees (one value per axis)
+    visits                       of each visit: number, repetitions, radians, degrees (one value per axis), aside
+                                 (radians, degrees), near
     measurements                 sum of all repetitions
-    handshake                    "pause": a person confirms each visit; "io": signals do, for each measurement
+    handshake                    "pause": a person confirms each measurement; "io": signals do
     ready, done, tool            as above, or what the user gave in place of them
     settle                       standstill before a measurement [s]
     share, percent               speed as a share of the largest, 0 … 1, and as a whole number of percent
     joints, unchecked            names of the joints; what nobody has checked
     value|fixed(9)               a number with nine decimals
     text|clipped(24)             at most so many characters of a text
+
+*Repetitions.* Each is a standstill of its own: before a further one the robot moves to ``aside`` and comes back,
+as in the timetable (``planning.tour``); where a visit is ``near`` the one before, also before the first one.
 
 Every text that a template gets is made of ASCII letters, digits and harmless signs alone, so that no name can end
 a comment or a string. Templates run in Jinja2's sandbox.
@@ -68,7 +72,7 @@ from calib_planner.planning import (
 )
 
 HANDSHAKES = ("pause", "io")
-"""How the robot learns that a visit was measured: a person confirms it, or signals do."""
+"""How the robot learns that it was measured: a person confirms it, or signals do."""
 SPEED_SHARE = 0.1
 """Usual share of the largest speed: the moves between the visits were not checked."""
 SETTLE = 1.0
@@ -208,12 +212,13 @@ def program_text(sheet: PlanSheet, form: ProgramFormat, settings: ProgramSetting
     settings = ProgramSettings() if settings is None else settings
     require_reachable(sheet, "no program goes there")
     axes = controller_axes(sheet, form, settings)
-    shown = axes * person_factors(sheet.robot)
+    times = sheet.timetable
+    beside = controller_axes(sheet, form, settings, times.aside)
+    first = np.cumsum(times.repetitions) - times.repetitions
+    near = np.isfinite(times.ways_back[first]).tolist()
     visits = [
-        {"number": i, "repetitions": k, "radians": q, "degrees": d}
-        for i, (k, q, d) in enumerate(
-            zip(sheet.plan.repetitions.tolist(), axes.tolist(), shown.tolist(), strict=True), 1
-        )
+        {"number": i, "repetitions": k, "near": n} | _values(q, sheet) | {"aside": _values(a, sheet)}
+        for i, (k, n, q, a) in enumerate(zip(times.repetitions.tolist(), near, axes, beside, strict=True), 1)
     ]
     share = check_number("speed_share", settings.speed_share, low=0, low_open=True, high=1.0)
     values = {
@@ -235,13 +240,20 @@ def program_text(sheet: PlanSheet, form: ProgramFormat, settings: ProgramSetting
     return _rendered(form, values).replace("\n", form.newline)
 
 
-def controller_axes(sheet: PlanSheet, form: ProgramFormat, settings: ProgramSettings) -> FloatArray:
-    """(m, joints) the visits in the controller's axes [rad | m], see the top of this file.
+def _values(axes: FloatArray, sheet: PlanSheet) -> dict[str, list[float]]:
+    """Of one place, axes (joints,) [rad | m]: as they are, and as people type them."""
+    return {"radians": axes.tolist(), "degrees": (axes * person_factors(sheet.robot)).tolist()}
+
+
+def controller_axes(
+    sheet: PlanSheet, form: ProgramFormat, settings: ProgramSettings, places: FloatArray | None = None
+) -> FloatArray:
+    """(m, joints) places in the controller's axes [rad | m], see the top of this file; ``None``: the visits.
 
     Raises:
         InputError: Another number of joints, or a sign, zero or coupling that cannot be.
     """
-    q, count = sheet.plan.configurations, len(sheet.plan.joint_names)
+    q, count = sheet.plan.configurations if places is None else places, len(sheet.plan.joint_names)
     if form.joints not in (None, count):
         raise InputError(
             "robot", f"{count} joints", f"{form.joints} joints for {form.title}", "write a template of your own"

@@ -241,9 +241,17 @@ def usual_pace(robot: Robot, dwell: float = DWELL, settle: float = SETTLE) -> Pa
     return Pace(speeds, dwell, text, settle)
 
 
-def backed_off(q: FloatArray, limits: FloatArray) -> FloatArray:
-    """``q`` (…, joints) moved by ``BACK_OFF`` towards the middle of the limits (joints, 2) [rad | m]."""
-    return np.asarray(q + BACK_OFF * np.where(q <= limits.mean(axis=1), 1.0, -1.0))
+def backed_off(q: FloatArray, limits: FloatArray, coupling: FloatArray | None = None) -> FloatArray:
+    """``q`` (…, joints) moved by ``BACK_OFF`` towards the middle of the limits (joints, 2) [rad | m].
+
+    Where the range is shorter than that, it is moved to its end. With a ``coupling`` (joints, joints), C of
+    ``robot.coupling``, limits and the move are those of the joints' own motions: nothing leaves its limits.
+    """
+    own = q if coupling is None else q @ coupling.T
+    low, high = limits.T
+    up, down = np.minimum(own + BACK_OFF, high), np.maximum(own - BACK_OFF, low)
+    inward = np.where(own <= limits.mean(axis=1), up, down)
+    return np.asarray(inward if coupling is None else inward @ np.linalg.inv(coupling).T)
 
 
 def near(way: FloatArray) -> NDArray[np.bool_]:
@@ -284,7 +292,7 @@ def visit_times(
     here = np.full(count, np.nan) if start is None else check_array("start", start, (count,))
     place = np.repeat(np.arange(len(q)), times)
     before = np.vstack([here, q[place[:-1]]])
-    aside = backed_off(q, robot.joint_limits)
+    aside = backed_off(q, robot.own_limits, robot.coupling)
     ways = np.abs(q[place] - before)
     if start is None:
         ways[0] = np.abs(robot.joint_limits.T - q[0]).max(axis=0)

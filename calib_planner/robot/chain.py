@@ -181,7 +181,7 @@ class Robot(Told):
         Raises:
             InputError: Not joints of the robot, or nothing that could be undone; names ``field``.
         """
-        own = self.joint_limits if self.motion_limits is None else self.motion_limits
+        own = self.own_limits
         if not couplings:
             return replace(self, couplings=(), motion_limits=None, joint_limits=own)
         matrix = coupling_matrix(couplings, self.joint_names, field)
@@ -245,13 +245,18 @@ class Robot(Told):
         """(joints, joints) C: motions are ``q @ C.T``; ``None`` where every joint is shown by itself."""
         return coupling_matrix(self.couplings, self.joint_names) if self.couplings else None
 
+    @property
+    def own_limits(self) -> FloatArray:
+        """(joints, 2) limits of the joints' own motions [rad | m]."""
+        return self.joint_limits if self.motion_limits is None else self.motion_limits
+
     def motions(self, q: NDArray[Any]) -> NDArray[Any]:
         """(N, joints) coordinates as shown → (N, joints) motions of the chain's joints [rad | m]."""
         return q if self.coupling is None else q @ self.coupling.T
 
     def beyond_limits(self, q: FloatArray) -> NDArray[np.bool_]:
         """(N, joints) [rad | m] → (N, joints) bool: which joints are outside their limits."""
-        low, high = (self.joint_limits if self.motion_limits is None else self.motion_limits).T
+        low, high = self.own_limits.T
         moved = self.motions(q)
         return np.asarray((moved < low - LIMIT_TOLERANCE) | (moved > high + LIMIT_TOLERANCE))
 
@@ -264,7 +269,7 @@ class Robot(Told):
         beyond = np.argwhere(self.beyond_limits(q))
         if len(beyond):
             i, j = (int(k) for k in beyond[0])
-            low, high = (self.joint_limits if self.motion_limits is None else self.motion_limits)[j]
+            low, high = self.own_limits[j]
             raise InputError(
                 f"{field}[{i}], joint {self.joint_names[j]}",
                 f"{self.motions(q)[i, j]:.6g}",

@@ -105,6 +105,7 @@ def make_tour(
     limits: FloatArray,
     speed: float,
     dwell: float,
+    coupling: FloatArray | None = None,
 ) -> Tour:
     """Visit every configuration as often as wanted.
 
@@ -112,9 +113,10 @@ def make_tour(
         start: (n,) where the robot is [rad | m].
         configurations: (m, n) [rad | m].
         repetitions: (m,) standstills at each.
-        limits: (n, 2) joint limits [rad | m].
+        limits: (n, 2) limits of the joints' own motions [rad | m].
         speed: Largest joint speed [rad/s | m/s].
         dwell: Length of a standstill [s].
+        coupling: (n, n) of a robot that shows joints against others, see ``Robot.coupling``.
     """
     phases: list[Phase] = []
     here, now = frozen(start), 0.0
@@ -128,7 +130,7 @@ def make_tour(
     for index, (goal, count) in enumerate(zip(configurations, repetitions, strict=True)):
         for _ in range(int(count)):
             if near(goal - here):
-                go(backed_off(goal, limits), index)
+                go(backed_off(goal, limits, coupling), index)
             go(goal, index)
             phases.append(Phase(now, now + dwell, here, here, index, True))
             now += dwell

@@ -33,7 +33,7 @@ def test_file_stdout_and_json_hold_the_same_program(plan_file: str, tmp_path: Pa
     status, out, err = call(capsys, plan_file, "--for", "krl", "--output", str(path))
     assert status == 0 and not err and "8 measurements" in out and "jog one joint" in out and "A1" not in out
     status, text, err = call(capsys, plan_file, "--for", "krl")
-    assert status == 0 and not err and path.read_bytes().decode() == text and text.count("PTP {") == 4
+    assert status == 0 and not err and path.read_bytes().decode() == text and text.count("PTP {") == 4 + 2 * 4
     status, out, _ = call(capsys, plan_file, "--for", "krl", "--json")
     assert status == 0 and json.loads(out)["program"] == text
 

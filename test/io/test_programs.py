@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from calib_planner.io import (
     program_text,
     read_program_format,
 )
-from calib_planner.planning import JointRange, PlanSheet, plan_sheet
+from calib_planner.planning import JointRange, PlanSheet, person_factors, plan_sheet
 from calib_planner.robot import parse_coupling
 
 CLOSE = 1e-9
@@ -228,23 +229,51 @@ def test_values_order_texts_and_signals_come_back(name: str, handshake_kind: str
     assert text.isascii() and ("\r\n" in text) == (form.newline == "\r\n")
     assert text.count("\n") == text.count(form.newline)
     read = READERS[name](text.replace("\r\n", "\n"))
-    np.testing.assert_allclose(read.axes, sheet.plan.configurations, rtol=0, atol=CLOSE)
     assert not KUKA.beyond_limits(np.array(read.axes)).any()
     ready, done = str(form.ready), str(form.done)
     assert next(e for e in read.events if e != ("out", (ready, 0))) == ("move", 1)
     expected: list[tuple[str, Any]] = [("out", (ready, 0))] if read.events[0][0] == "out" else []
+    waits = handshake(ready, done) if handshake_kind == "io" else [("hold", 1)]
+    places: list[Any] = []
     for i, times in enumerate(REPETITIONS, 1):
-        expected += [("move", i), ("wait", "2.50")]
-        if handshake_kind == "io":
-            for k in range(1, times + 1):
-                expected += [("text", (i, k, times)), *handshake(ready, done)]
-        else:
-            expected += [("text", (i, times)), ("hold", 1)]
+        here = sheet.plan.configurations[i - 1]
+        for k in range(1, times + 1):
+            for place in (here + inward(here), here)[k == 1 :]:  # off and back, but for the first
+                places.append(place)
+                expected.append(("move", len(places)))
+            expected += [("wait", "2.50"), ("text", (i, k, times)), *waits]
     assert [(kind, understood(value) if kind == "text" else value) for kind, value in read.events] == expected
+    np.testing.assert_allclose(read.axes, places, rtol=0, atol=CLOSE)
+
+
+def inward(q: np.ndarray) -> np.ndarray:
+    """(joints,) 0.05 rad of every joint, away from its nearer limit: where the timetable turns round."""
+    low, high = KUKA.joint_limits.T
+    return np.asarray(np.where(high - q >= q - low, 0.05, -0.05))
+
+
+def stops(read: Read) -> np.ndarray:
+    """(stops, joints) where the robot stands before each text."""
+    at = [value for kind, value in read.events if kind in ("move", "text")]
+    return np.array([read.axes[a - 1] for a, b in itertools.pairwise(at) if isinstance(b, str)])
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_the_robot_backs_off_where_the_timetable_says(name: str) -> None:
+    """From visit to visit, too, where both are nearly at one place; program and trajectory agree."""
+    q = random_configurations(KUKA, 4, 5)
+    q[2] = q[1] + 0.4 * inward(q[1])
+    sheet = plan_sheet(replace(plan_of(KUKA, q), repetitions=np.array(REPETITIONS)), KUKA)
+    read = READERS[name](program_text(sheet, read_program_format(name)).replace("\r\n", "\n"))
+    points = [p for p, _ in sheet.timetable.points(q)]  # at rest before and after each measurement, and aside
+    ways = [a for a, b in itertools.pairwise([*points, None]) if a != b]
+    assert len(ways) == len(read.axes) == 4 + 2 * 3 + 1
+    np.testing.assert_allclose(read.axes, ways, rtol=0, atol=CLOSE)
+    np.testing.assert_allclose(stops(read), np.repeat(q, REPETITIONS, axis=0), rtol=0, atol=CLOSE)
 
 
 def understood(words: str) -> tuple[int, ...]:
-    """Visit, then measurement and repetitions, or repetitions alone; four visits in all."""
+    """Visit, then measurement and repetitions; four visits in all."""
     visit, visits, *rest = (int(n) for n in re.findall(r"\d+", words))
     assert visits == 4
     return (visit, *rest)
@@ -295,7 +324,7 @@ def test_names_cannot_end_a_comment_or_a_text(name: str) -> None:
     """The readers refuse every line that they do not expect."""
     evil = replace(KUKA, name='x";\nHALT\n*/ ]] end\r\n{{ 7 * 7 }} é')
     text = program_text(kuka_sheet(evil), read_program_format(name))
-    assert len(READERS[name](text.replace("\r\n", "\n")).axes) == 4
+    assert len(READERS[name](text.replace("\r\n", "\n")).axes) == 10
     assert text.isascii() and (name == "fanuc" or "x___HALT_" in text)
 
 
@@ -337,12 +366,15 @@ def test_a_robot_of_other_joints_needs_a_template_of_its_own(tmp_path: Path) -> 
     path = tmp_path / "own.j2"
     path.write_text(
         "{#---\ntitle: Own\nsuffix: .txt\nname_length: 9\nready: 1\ndone: 2\n---#}\n"
-        "{% for v in visits %}{{ v.radians|join(' ') }} | {{ v.degrees|join(' ') }}\n{% endfor %}"
+        "{% for v in visits %}{% for p in (v, v.aside) %}{{ p.radians|join(' ') }} | {{ p.degrees|join(' ') }}\n"
+        "{% endfor %}{% endfor %}"
     )
     lines = program_text(sheet, read_program_format(str(path))).splitlines()
     si, shown = (np.array([numbers(line.split("|")[k]) for line in lines]) for k in (0, 1))
-    np.testing.assert_allclose(si, sheet.plan.configurations, rtol=1e-12)
-    np.testing.assert_allclose(shown, sheet.degrees, rtol=1e-12)
+    np.testing.assert_allclose(si[::2], sheet.plan.configurations, rtol=1e-12)
+    np.testing.assert_allclose(si[1::2], sheet.timetable.aside, rtol=1e-12)
+    np.testing.assert_allclose(shown[::2], sheet.degrees, rtol=1e-12)
+    np.testing.assert_allclose(shown[1::2], sheet.timetable.aside * person_factors(robot), rtol=1e-12)
 
 
 HEAD = "{#---\ntitle: T\nsuffix: .t\nname_length: 9\nready: 1\ndone: 1\n---#}\n"

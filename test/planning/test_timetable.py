@@ -8,8 +8,9 @@ from robots import mixed, plan_of, random_configurations
 
 from calib_planner import Robot
 from calib_planner.errors import InputError
-from calib_planner.planning import Pace, timetable, usual_pace, visit_times, visiting_order
-from calib_planner.planning.tour import LONGEST, SHORTEST
+from calib_planner.planning import Pace, backed_off, timetable, usual_pace, visit_times, visiting_order
+from calib_planner.planning.tour import BACK_OFF, LONGEST, SHORTEST
+from calib_planner.robot import parse_coupling
 
 
 def fastest(seconds: float, way: np.ndarray) -> np.ndarray:
@@ -35,6 +36,21 @@ def test_no_joint_is_too_fast_and_one_is_as_fast_as_it_may(make):
         ratio = fastest(length, way) / speeds
         assert ratio.max() == pytest.approx(1.0, abs=1e-6)
     assert times.seconds == times.leave[-1] and times.standing == pytest.approx(9 * 4.0)
+
+
+def test_backing_off_leaves_no_limit():
+    """A narrow joint goes to its far limit; of coupled joints the joints' own motions keep theirs."""
+    limits = np.array([[-0.01, 0.02], [-1.0, 1.0], [0.0, 0.08]])
+    away = backed_off(np.array([[0.0, 0.5, 0.05], [0.02, -0.5, 0.0]]), limits)
+    np.testing.assert_allclose(away, [[0.02, 0.45, 0.0], [-0.01, -0.45, 0.05]], rtol=0, atol=1e-15)
+    robot = Robot.load("kuka_kr270").with_couplings([parse_coupling("joint_a3-=joint_a2")])
+    corners = np.where(np.random.default_rng(6).random((64, 6)) < 0.5, *robot.own_limits.T)
+    shown = corners.copy()
+    shown[:, 2] -= corners[:, 1]
+    plan = plan_of(robot, shown)
+    aside = timetable(plan, robot, usual_pace(robot)).aside
+    assert not robot.beyond_limits(aside).any()
+    np.testing.assert_allclose(np.abs(robot.motions(aside) - corners), BACK_OFF, rtol=0, atol=1e-12)
 
 
 def test_an_unknown_start_has_no_travel_and_time_enough_from_anywhere():

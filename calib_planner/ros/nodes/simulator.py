@@ -134,9 +134,10 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             self._itinerary.at(np.array([self.now])).joints[0],
             plan.configurations,
             plan.repetitions,
-            self.world.robot.joint_limits,
+            self.world.robot.own_limits,
             self.settings.value.joint_speed,
             dwell or self.settings.value.dwell,
+            self.world.robot.coupling,
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
         with self._present:
