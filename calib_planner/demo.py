@@ -45,8 +45,9 @@ RANDOM_PLANS = 12
 PAGE = "calibration.html"
 """The report, in the folder of a demonstration."""
 ROBOT = "kuka_kr270"
-SEED = 3
-"""A robot that errs by 5 mm at the test pose before its calibration; those of other seeds err by 1 … 12 mm."""
+SEED = 0
+"""One robot, the first: not chosen by its result. It errs by 8.9 mm at the test pose before its calibration; the
+robots of seeds 0 … 19 err by 0.6 … 14.9 mm."""
 ERROR_MODEL = "typical"
 """How the robot of the demonstrations errs besides its parameters, see ``read_error_model``."""
 TEST_POSE = tuple(np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0]))

@@ -1,6 +1,6 @@
 """Starts planner, identifier and simulated tracker; then ask for a plan and have it executed.
 
-    ros2 launch calib_planner demo.launch.py robot:=kuka_kr270 seed:=3 save_folder:=$HOME/calibration rviz:=true
+    ros2 launch calib_planner demo.launch.py robot:=kuka_kr270 seed:=1 save_folder:=$HOME/calibration rviz:=true
     ros2 service call /calibration_planner/request_plan calib_planner_msgs/srv/PlanCalibration \
         "{test_poses: [0, -1.047, 1.571, 0, 0.785, 0], configurations: 12}"
     ros2 topic echo --once /calibration_planner/current_plan        # the plan, for the action's goal

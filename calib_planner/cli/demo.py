@@ -18,7 +18,7 @@ and with random plans of the same size. Needs no ROS. Shown in mm; with --json i
 
 def add(commands: Commands, summary: str) -> None:
     usual = DemoSettings()
-    parser = add_command(commands, "demo", summary, run, "calib-planner demo --seed 3", DESCRIPTION, cell=False)
+    parser = add_command(commands, "demo", summary, run, "calib-planner demo --seed 1", DESCRIPTION, cell=False)
     option(parser, "--configurations", "M", "number of different configurations", usual.configurations)
     option(parser, "--repetitions", "K", "number of measurements at each configuration", usual.repetitions)
     option(parser, "--sigma", "S", "standard deviation of one coordinate of the tracker [m]", usual.sigma)

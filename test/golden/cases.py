@@ -393,7 +393,7 @@ def _others() -> list[Case]:
         *(Case(f"robots_{r}", f"robots show {r}") for r in ("planar_2r", "kuka_kr270", "ur10e", "arm.urdf")),
         Case(
             "demo",
-            "demo --seed 3 --configurations 15 --output d",
+            "demo --configurations 15 --output d",
             tuple(
                 f"d/{n}"
                 for n in (
