@@ -10,6 +10,15 @@ is within the tolerance, and were the tracker's clock ahead, the joints' rest al
 result comes once per standstill: as soon as there are enough samples; after ``patience`` with what there is; or
 when the robot moves on. A standstill that ends without a result gives a rejection that says why.
 
+The two streams see a motion at different times, and a motion must not spoil the standstill before or after it:
+
+* Points wait for the next joint state. If that one shows a motion, the points after the last joint state at rest
+  belong to the motion and do not count.
+* A motion begins slowly: points leave their tolerance before the joints leave theirs. If that happens less than
+  ``settle`` before the joints were last seen at rest, what was measured before it counts.
+* A motion ends slowly: its end is within the tolerance of the first samples at rest, and noise may break the rest
+  for it much later. Then the rest begins later, within ``settle`` of its first sample, and goes on.
+
 The tolerance on points has to be several times the tracker's noise: with σ = 0.03 mm the range of a thousand
 samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do as well as live ones.
 """
@@ -18,8 +27,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -151,11 +161,13 @@ class StandstillDetector:
         self.target_count = check_count("targets", targets, high=1000)
         self._order: StampOrder[FloatArray] = StampOrder(1 + targets, _ns(s.window), _ns(s.skew))
         horizon, gap = _ns(s.settle + max(s.patience, s.duration) + s.gap), _ns(s.gap)
-        self._joints = RestWindow(s.joint_tolerance, gap, horizon)
-        self._targets = [RestWindow(s.point_tolerance, gap, horizon) for _ in range(targets)]
+        self._joints = RestWindow(s.joint_tolerance, gap, _ns(s.settle), horizon)
+        self._targets = [RestWindow(s.point_tolerance, gap, _ns(s.settle), horizon) for _ in range(targets)]
         self.clocks = ClockOffsets(targets, _ns(s.skew), _ns(s.duration) // 2)
         self._measured: FloatArray | None = None
         self._rest = (0, 0)  # stamps of the rest in which something was measured, so far
+        self._joints_until: int | None = None  # last stamp of the joints in order
+        self._waiting: deque[tuple[int, int, FloatArray]] = deque()  # (target, stamp, point) after it
         self._complained = False
         self._saw_nan = False
         self._nan_in_a_row = [0] * (1 + targets)
@@ -177,6 +189,7 @@ class StandstillDetector:
         """Take what still waits, and the last standstill as ended: the end of a recording."""
         results = self._process(everything=True) + self._ended()
         self.clocks.clear()
+        self._waiting.clear()
         self._joints.samples.clear()
         self._measured = None
         return results
@@ -238,14 +251,17 @@ class StandstillDetector:
         results: list[Standstill | Rejection] = []
         for stamp, stream, value in self._order.ready(everything=everything):
             if stream:
-                self._on_point(stream - 1, stamp, value)
+                self._waiting.append((stream - 1, stamp, value))
+                results += self._on_silence(stamp)
             else:
                 results += self._on_joints(stamp, value)
+                self._on_points()
             results += self._complete(stamp)
         return results
 
     def _on_joints(self, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
         joints, results = self._joints, []
+        self._joints_until = stamp
         if self._measured is not None:
             if np.max(np.abs(value - self._measured)) <= joints.tolerance:
                 self._rest = (self._rest[0], stamp)
@@ -253,24 +269,47 @@ class StandstillDetector:
             self.clocks.add_joints(*self._rest)
             self._measured = None
             joints.samples.clear()
-        elif joints.samples and not (joints.on_time(stamp) and joints.spread_with(value) <= joints.tolerance):
-            self.clocks.add_joints(joints.since, joints.last)
-            results = self._ended()
-            joints.samples.clear()
+        elif joints.samples and not joints.goes_on(stamp, value) and not joints.begin_later(stamp, value):
+            results = self._moved_on()
         if not joints.samples:
             self._complained = self._saw_nan = False
             for window in self._targets:
-                window.moved_by = 0.0
+                window.moved_by, window.before = 0.0, None
         joints.push(stamp, value)
         return results
 
+    def _moved_on(self) -> list[Standstill | Rejection]:
+        """The joints' rest has ended without a result so far."""
+        rest = self._joints.since, self._joints.last
+        results = self._ended()
+        if self._measured is None:
+            self.clocks.add_joints(*rest)
+            self._joints.samples.clear()
+        return results
+
+    def _on_silence(self, stamp: int) -> list[Standstill | Rejection]:
+        """Let the points in without a joint state, if the joints' last one is a gap before ``stamp`` [ns]."""
+        until, gap = self._joints_until, self._joints.gap
+        if until is not None and 0 <= stamp - until <= gap and len(self._waiting) < MOST_SAMPLES:
+            return []
+        over = self._measured is None and self._joints.samples and stamp - self._joints.last > gap
+        results = self._moved_on() if over else []
+        self._on_points()
+        return results
+
+    def _on_points(self) -> None:
+        """Take the points that waited."""
+        while self._waiting:
+            self._on_point(*self._waiting.popleft())
+
     def _on_point(self, target: int, stamp: int, value: FloatArray) -> None:
-        window = self._targets[target]
-        at_rest = self._joints.samples and stamp >= self._joints.since + _ns(self.settings.settle)
-        if at_rest and self._measured is None and window.on_time(stamp):
+        window, begin = self._targets[target], self._joints.since + _ns(self.settings.settle)
+        at_rest = self._joints.samples and self._measured is None and window.last >= begin
+        if at_rest and window.on_time(stamp):
             spread = window.spread_with(value)
             if spread > window.tolerance:
                 window.moved_by = max(window.moved_by, spread)
+                window.keep(stamp, begin)
         if (rest := window.push(stamp, value)) is not None:
             self.clocks.add_point(target, *rest)
 
@@ -286,27 +325,35 @@ class StandstillDetector:
         if all(len(w.samples) >= s.samples and end - w.last <= w.gap for w in self._targets):
             start = max(begin, *(w.settled(_ns(s.settle)) for w in self._targets))
             if end - start >= _ns(s.duration):
-                standstill = self._average(start, end, s.samples)
+                standstill = self._average(start, end, s.samples, self._targets)
                 if standstill is not None and (standstill.samples >= s.samples).all():
                     return self._take(standstill)
         if end - begin < _ns(s.patience) or self._complained:
             return []
-        return self._what_there_is(begin, end)
+        return self._what_there_is(begin, end, self._targets)
 
     def _ended(self) -> list[Standstill | Rejection]:
         """The joints moved on: the standstill's result, if it was long enough to be one."""
-        begin, end = self._joints.since + _ns(self.settings.settle), self._joints.last
+        settle = _ns(self.settings.settle)
+        begin, end = self._joints.since + settle, self._joints.last
         brief = end - begin < _ns(self.settings.duration) // 2
-        if self._measured is not None or not self._joints.samples or brief or self._complained:
+        if self._measured is not None or not self._joints.samples or brief:
             return []
-        return self._what_there_is(begin, end)
+        windows = [w.until_it_left(end - settle) for w in self._targets]
+        return self._what_there_is(begin, end, windows)
 
-    def _what_there_is(self, begin: int, end: int) -> list[Standstill | Rejection]:
+    def _what_there_is(self, begin: int, end: int, windows: Sequence[RestWindow]) -> list[Standstill | Rejection]:
+        """The result from ``begin`` to ``end`` [ns], if there are few points only; else a rejection, once."""
         least, settle = self.settings.minimum_samples, _ns(self.settings.settle)
-        starts = [max(begin, w.settled(settle)) for w in self._targets if len(w.samples) >= least]
-        standstill = self._average(max(starts), end, least) if starts else None
-        if standstill is not None and 2 * (standstill.end - standstill.start) >= _ns(self.settings.duration):
-            return self._take(standstill)
+        used = [w for w in windows if len(w.samples) >= least]
+        if used:
+            first = max(begin, *(w.settled(settle) for w in used))
+            last = min([end, *(w.last for w in used if w.left)])
+            standstill = self._average(first, last, least, windows)
+            if standstill is not None and 2 * (last - first) >= _ns(self.settings.duration):
+                return self._take(standstill)
+        if self._complained:
+            return []
         self._complained = True
         return [self._rejection(begin, end, *self._why(begin, end))]
 
@@ -316,13 +363,13 @@ class StandstillDetector:
         self._joints.samples.clear()
         return [standstill]
 
-    def _average(self, start: int, end: int, least: int) -> Standstill | None:
+    def _average(self, start: int, end: int, least: int, windows: Sequence[RestWindow]) -> Standstill | None:
         """Means over [start, end] of the targets with at least ``least`` samples; None if there are none."""
         q = self._joints.between(start, end)
         points = np.full((self.target_count, 3), np.nan)
         std = np.full(self.target_count, np.nan)
         samples = np.zeros(self.target_count, np.int64)
-        for k, window in enumerate(self._targets):
+        for k, window in enumerate(windows):
             rows = window.between(start, end)
             if len(rows) < least:
                 continue
@@ -341,7 +388,7 @@ class StandstillDetector:
             return RejectionReason.MOVED, f"{text}: wait until nothing vibrates, or raise point_tolerance"
         if self._saw_nan:
             return RejectionReason.NOT_FINITE, "values are not finite: check line of sight and the drivers"
-        if end - begin < _ns(self.settings.duration):
+        if end - begin < _ns(min(self.settings.duration, self.settings.patience)):
             return (
                 RejectionReason.MOVED,
                 f"the robot moved on {(end - begin) / NANO:.2f} s after settling: dwell longer",
@@ -381,27 +428,39 @@ class RestWindow:
     Attributes:
         tolerance: Largest range of a coordinate [rad | m].
         gap: Longest pause between samples [ns].
+        settle: Time after a motion whose samples may be farther from later ones [ns].
         horizon: Samples older than this are forgotten [ns].
         since, last: Stamps of the first and the last sample of the rest [ns].
         arrived: Whether a motion came before the rest, as far as seen: not a gap.
+        left: Stamp of the sample that broke this rest, which was kept; 0 while it is the newest [ns].
         moved_by: Kept for who asks why there was no standstill [m].
+        before: The longest rest during the standstill of the joints that was broken.
         samples: ``(stamp, value)``, the oldest first.
     """
 
     tolerance: float
     gap: int
+    settle: int
     horizon: int
     since: int = 0
     last: int = 0
     arrived: bool = False
+    left: int = 0
     moved_by: float = 0.0
+    before: RestWindow | None = None
     samples: deque[tuple[int, FloatArray]] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
     _low: FloatArray = field(default_factory=lambda: np.empty(0))
     _high: FloatArray = field(default_factory=lambda: np.empty(0))
+    _first: int = 0  # stamp of the first sample, also where the rest begins later by now
+    _late: tuple[int, FloatArray, FloatArray] | None = None  # from ``settle`` after it: first stamp, range
 
     def on_time(self, stamp: int) -> bool:
         """Whether ``stamp`` follows the last sample without a gap."""
         return bool(self.samples) and 0 < stamp - self.last <= self.gap
+
+    def goes_on(self, stamp: int, value: FloatArray) -> bool:
+        """Whether the rest goes on with ``value`` at ``stamp`` [ns]."""
+        return self.on_time(stamp) and self.spread_with(value) <= self.tolerance
 
     def settled(self, settle: int) -> int:
         """Stamp from which on it is at rest, ``settle`` [ns] after a motion."""
@@ -414,19 +473,56 @@ class RestWindow:
     def push(self, stamp: int, value: FloatArray) -> tuple[int, int] | None:
         """Take a sample; one that breaks the rest begins a new one, and gives the old one's interval [ns]."""
         ended = None
-        if self.on_time(stamp) and self.spread_with(value) <= self.tolerance:
-            self._low, self._high = np.minimum(self._low, value), np.maximum(self._high, value)
-        else:
+        if not self.goes_on(stamp, value) and not self.begin_later(stamp, value):
             self.arrived = self.on_time(stamp)
             ended = (self.since, self.last) if self.samples else None
             self.samples.clear()
+            self._late = None
             self._low = self._high = value
-            self.since = stamp
+            self.since = self._first = stamp
+        self._low, self._high = np.minimum(self._low, value), np.maximum(self._high, value)
+        if stamp > self._first + self.settle:
+            _, low, high = self._late or (stamp, value, value)
+            self._late = (
+                (stamp if self._late is None else self._late[0]),
+                np.minimum(low, value),
+                np.maximum(high, value),
+            )
         self.last = stamp
         self.samples.append((stamp, value))
         while self.samples[0][0] < stamp - self.horizon:
             self.samples.popleft()
         return ended
+
+    def begin_later(self, stamp: int, value: FloatArray) -> bool:
+        """Whether the rest goes on with ``value`` at ``stamp`` [ns] if it begins later; from now on it does.
+
+        It may begin with any sample up to the first one ``settle`` after its first.
+        """
+        if not self.on_time(stamp):
+            return False
+        head = list(takewhile(lambda s: s[0] <= self._first + self.settle, self.samples))
+        stamps = [t for t, _ in head] + ([] if self._late is None else [self._late[0]])
+        rows = np.array([v for _, v in head] + ([] if self._late is None else list(self._late[1:])) + [value])
+        low, high = (f.accumulate(rows[::-1])[::-1] for f in (np.minimum, np.maximum))
+        fits = np.flatnonzero(np.max(high - low, axis=1)[: len(stamps)] <= self.tolerance)
+        if not len(fits):
+            return False
+        k = int(fits[0])
+        self.since, self.arrived, self._low, self._high = stamps[k], True, low[k], high[k]
+        for _ in range(k):
+            self.samples.popleft()
+        return True
+
+    def keep(self, stamp: int, begin: int) -> None:
+        """Keep this rest, which ``stamp`` breaks, unless a longer one lasted beyond ``begin`` [ns]."""
+        other = self.before
+        if other is None or other.last < begin or len(other.samples) <= len(self.samples):
+            self.before = replace(self, left=stamp, before=None, samples=self.samples.copy())
+
+    def until_it_left(self, after: int) -> RestWindow:
+        """The rest before, if it was broken at ``after`` [ns] or later; else this one."""
+        return self.before if self.before is not None and self.before.left >= after else self
 
     def between(self, start: int, end: int) -> FloatArray:
         """(samples, n) values with stamps in [start, end]."""

@@ -106,6 +106,7 @@ def make_tour(
     speed: float,
     dwell: float,
     coupling: FloatArray | None = None,
+    shortest: float = 0.0,
 ) -> Tour:
     """Visit every configuration as often as wanted.
 
@@ -117,13 +118,15 @@ def make_tour(
         speed: Largest joint speed [rad/s | m/s].
         dwell: Length of a standstill [s].
         coupling: (n, n) of a robot that shows joints against others, see ``Robot.coupling``.
+        shortest: Least length of a move [s]; if it is a period of the joint states, at least one of them shows that
+            the robot backed off, whatever the speed.
     """
     phases: list[Phase] = []
     here, now = frozen(start), 0.0
 
     def go(goal: FloatArray, index: int) -> None:
         nonlocal here, now
-        length = PEAK * float(np.max(np.abs(goal - here))) / speed
+        length = max(PEAK * float(np.max(np.abs(goal - here))) / speed, shortest)
         phases.append(Phase(now, now + length, here, frozen(goal), index, False))
         here, now = frozen(goal), now + length
 

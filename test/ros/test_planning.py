@@ -240,7 +240,10 @@ HOSTILE = {
     "name": urdf(2).replace('name="wire"', f'name="{"x" * 5000}"'),
     "control": urdf(2).replace('name="wire"', 'name="a&#10;b"'),
     "doubled": urdf(2).replace('name="j1"', 'name="j0"'),
-    "xacro": urdf(2, inside='<xacro:include filename="/etc/passwd"/>'),
+    "xacro": '<robot name="x"><xacro:include filename="/etc/passwd"/><xacro:arm name="a"/></robot>',
+    "expression": urdf(2).replace('xyz="0.1 0 0.4"', 'xyz="${a} 0 0.4"'),
+    "infinite limits": urdf(2).replace('lower="-2" upper="2"', 'lower="-inf" upper="inf"'),
+    "mimic": urdf(2).replace('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><mimic joint="j0" multiplier="1e300"/>'),
     "loop": urdf(2, inside='<joint name="x" type="fixed"><parent link="l2"/><child link="l0"/></joint>'),
     "velocity": urdf(2, limit='velocity="fast"'),
 }
@@ -251,3 +254,18 @@ def test_a_hostile_description_is_refused_with_a_reason(text: str) -> None:
     with pytest.raises(InputError) as caught:
         described_model(text)
     assert "robot_description" in str(caught.value) and "root:" not in str(caught.value)
+
+
+def test_leftovers_of_xacro_beside_a_chain_are_never_followed(tmp_path: Path) -> None:
+    """As the reader of files does, where the chain is sound as it stands; nothing is opened or evaluated."""
+    (tmp_path / "more.xacro").write_text('<robot><link name="extra"/></robot>')
+    inside = f'<xacro:include filename="{tmp_path}/more.xacro"/><xacro:property name="a" value="${{1/0}}"/>'
+    model, plain = described_model(urdf(2, inside=inside)), described_model(urdf(2))
+    assert model.robot.joint_names == plain.robot.joint_names
+    np.testing.assert_array_equal(model.robot.positions([0.1, 0.2]), plain.robot.positions([0.1, 0.2]))
+
+
+@pytest.mark.parametrize("limit", ["1e9", "1e300"])
+def test_absurd_limits_of_a_turning_joint_are_a_turn(limit: str) -> None:
+    text = urdf(2).replace('lower="-2" upper="2"', f'lower="-{limit}" upper="{limit}"')
+    np.testing.assert_array_equal(described_model(text).robot.joint_limits, [[-np.pi, np.pi]] * 2)

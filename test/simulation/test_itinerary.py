@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from calib_planner.simulation import NANO, Itinerary, make_tour
@@ -20,6 +22,18 @@ def test_many_times_at_once_are_one_after_the_other() -> None:
         begun = sum(p.measuring and p.begin <= t for p in tour.phases)
         assert arrival == begun - 1
         assert since == (t - phase.begin if phase.measuring else np.inf)
+
+
+def test_however_fast_a_joint_state_shows_that_the_robot_backed_off() -> None:
+    """At 50 rad/s the way aside and back takes 4 ms, joint states come every 20 ms."""
+    period = 0.02
+    tour = make_tour(np.zeros(2), Q[:1], np.array([5]), LIMITS, 50.0, 0.1, shortest=period)
+    rests = [p for p in tour.phases if p.measuring]
+    for before, after in pairwise(rests):
+        for phase in np.linspace(0.0, 1.0, 23):
+            times = (np.arange(before.end / period, after.begin / period + 1) + phase) * period
+            between = [float(t) for t in times if before.end < t < after.begin]
+            assert max(np.abs(tour.at(t).joints(t) - Q[0]).max() for t in between) > 0.02
 
 
 def test_arrivals_are_counted_over_all_tours() -> None:

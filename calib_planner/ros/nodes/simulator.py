@@ -138,6 +138,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             self.settings.value.joint_speed,
             dwell or self.settings.value.dwell,
             self.world.robot.coupling,
+            shortest=1.0 / self.settings.value.joint_rate,
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
         with self._present:
