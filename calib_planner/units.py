@@ -11,6 +11,7 @@ import re
 import reprlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from decimal import Decimal
 from html import escape
 
 import numpy as np
@@ -107,7 +108,8 @@ def quantity(text: str, unit: str = "m") -> float:
         examples = ", ".join(name for name in others if name.isascii())
         hint = "; use a decimal point" if re.fullmatch(r"\s*[-+]?\d+,\d+\s*\D*", text) else ""
         raise ValueError(f"expected a number [{unit}], or one with its unit ({examples}), got {text!r}{hint}")
-    return float(match[1]) / others[match[2] or unit]
+    # In decimals: 0.03 mm is 3e-05 m, and not 2.9999999999999997e-05.
+    return float(Decimal(match[1]) / Decimal(repr(others[match[2] or unit])))
 
 
 def length(metres: float) -> str:

@@ -188,6 +188,13 @@ def _find_unknown(robot: Robot, sources: Sources, args: argparse.Namespace, term
             f"The points are {length(answer.before)} from the robot as it is stated, and {placed}: "
             f"--unknown {args.unknown} was taken (--unknown {KNOWN} if the places are known)."
         )
+    elif answer.unexplained:
+        args.unknown = "base,tool"  # a mistake can only be told from a place with all places free
+        terminal.note(
+            f"The points are {length(answer.before)} from the robot as it is stated, and no place of base and "
+            "reflectors explains that (another robot, other units, order or signs of the joints?): "
+            "--unknown base,tool was taken to look for the cause."
+        )
     elif strange:
         terminal.note(f"The robot has no place for {count} reflectors: --unknown tool was taken.")
 

@@ -170,6 +170,13 @@ TABLE = {
             "check the tracker's compensation of the air and the scale of the points, then measure again",
         ),
         Row(
+            "mirror",
+            "gross",
+            "the frame of the points is left-handed",
+            "the points are mirrored: their frame is left-handed",
+            "change the sign of one coordinate of all points, or exchange the two that were exchanged",
+        ),
+        Row(
             "units",
             "gross",
             "the points are in mm, cm, inches or feet; joint angles are in degrees",
@@ -182,6 +189,13 @@ TABLE = {
             "one joint runs the other way",
             "{joint} runs the other way than in the robot model",
             "change the sign of the column {joint} in the data, or of its axis in the robot file",
+        ),
+        Row(
+            "signs",
+            "gross",
+            "every joint runs the other way",
+            "every joint runs the other way than in the robot model",
+            "change the sign of all joint columns in the data, or of all axes in the robot file",
         ),
         Row(
             "zero",
@@ -202,7 +216,7 @@ TABLE = {
             "both",
             "one joint is shown, or driven, together with another one",
             "{joint} is coupled to {beside}: it stands at {joint} {size} {beside}",
-            "add --couple {option} if the controller shows it so; otherwise replace the column {joint} "
+            "{first}add --couple {option} if the controller shows it so; otherwise replace the column {joint} "
             "of the data by {joint} {size} {beside}",
         ),
         Row(
@@ -292,7 +306,7 @@ class Alternative:
 def _named(code: str, size: float, unit: str, words: dict[str, Any], **more: Any) -> Alternative:
     """An alternative in the words of its row."""
     row = TABLE[code]
-    told = {k: v for k, v in more.items() if k in ("row", "target", "joint", "beside")} | words
+    told = {k: v for k, v in more.items() if k in ("row", "target", "joint", "beside")} | {"first": ""} | words
     return Alternative(code, row.text.format(**told), row.advice.format(**told), float(size), unit, **more)
 
 
@@ -768,6 +782,8 @@ class _Fine:
         told: dict[str, Any] = {"size": words, "parameter": q.parameter, "rows": _ranges(q.rows)}
         if q.code == "couple":
             told["option"] = Coupling(str(joint), str(beside), float(f"{-first:.4g}"))
+            full = self.here.robot.with_parameters("full").parameter_names
+            told["first"] = "" if set(full) <= set(self.problem.robot.parameter_names) else FULL_FIRST
         return _named(
             q.code,
             size,
@@ -1016,6 +1032,8 @@ def _rows(rows: tuple[int, ...]) -> str:
 
 # ── gross: what is assumed is so wrong that no fit makes sense ───────────────────────────────────────
 
+FULL_FIRST = "free all parameters first (--parameters full), as axes that are tilted look like this; then "
+"""Advice before a coupling is believed while parameters of the placement are fixed."""
 GROSS = 0.01
 """Share of its extent beyond which no industrial robot errs: ten times what zeros alone left on real arms."""
 SOUND = 0.02
@@ -1038,7 +1056,7 @@ RANK_ROUNDS, FIT_ROUNDS = 3, 8
 """Rounds of weights while changes are ranked, and of a fit of the zeros."""
 MOST_ROWS = 60
 """Rows that are tried, evenly spread."""
-PREFERRED = ("sign", "columns", "targets", "rows", "couple", "zero")
+PREFERRED = ("sign", "signs", "mirror", "columns", "targets", "rows", "couple", "zero")
 """Discrete changes, the one to name first if several explain the same: a wrist bends the other way if its middle
 joint changes its sign, or if the joint before it is turned by half."""
 FITTED = ("scale", "ratio", "setup")
@@ -1247,6 +1265,9 @@ class _Gross:
             yield self._change(
                 "sign", _with_column(q, j, -q[:, j]), p, words={}, size=-1.0, unit="1", joint=names[j]
             )
+        if len(moving) > 1:
+            yield self._change("signs", -q, p, size=-1.0, unit="1")
+        yield self._change("mirror", q, p * [1.0, -1.0, 1.0], size=-1.0, unit="1")
         for j in np.flatnonzero(self.turns).tolist():
             for degrees in (90, -90, 180):
                 turned = _with_column(q, j, q[:, j] + np.deg2rad(degrees))

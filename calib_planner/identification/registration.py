@@ -208,11 +208,13 @@ class Misplacement:
         unknown: ``base``, ``tool``, both, or nothing.
         before: Median distance of the points from the robot as it was given [m].
         after: The same with ``unknown`` fitted [m].
+        unexplained: Whether the points are far from the robot wherever it and its targets stand.
     """
 
     unknown: tuple[str, ...]
     before: float
     after: float
+    unexplained: bool = False
 
 
 def find_misplacement(robot: Robot, data: Measurements) -> Misplacement:
@@ -236,7 +238,7 @@ def find_misplacement(robot: Robot, data: Measurements) -> Misplacement:
             continue
         if after * NO_BETTER < best.after:
             best = Misplacement(unknown, before, after)
-    return best if best.after < EXPLAINED * before else nothing
+    return best if best.after < EXPLAINED * before else replace(nothing, unexplained=True)
 
 
 def _median(robot: Robot, data: Measurements) -> float:

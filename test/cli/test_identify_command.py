@@ -362,6 +362,22 @@ def test_base_and_tool_are_found_out_and_said(
     np.testing.assert_array_equal(values(alone), values(given))
 
 
+def test_a_reversed_joint_is_named_where_nobody_said_what_is_unknown(
+    run: Run, arm: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The tracker stands anywhere and joint 2 runs the other way: both are found out, with no option."""
+    urdf, data = arm
+    head, *rows = data.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    second = head.split(",")[1]
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text("\n".join([head, *(",".join([r[0], str(-float(r[1])), *r[2:]]) for r in cells)]) + "\n")
+    main(["identify", "--robot", str(urdf), "--data", str(wrong)])
+    out, err = capsys.readouterr()
+    assert "--unknown base,tool was taken to look for the cause" in err
+    assert f"{second} runs the other way" in " ".join((out + err).split())
+
+
 def test_places_that_are_known_are_left_alone(
     run: Run, points: Path, arm: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

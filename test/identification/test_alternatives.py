@@ -99,7 +99,7 @@ def findings(one: Cell, data: Measurements) -> tuple[Alternative, ...]:
 
 def test_every_row_says_what_happened_and_what_to_do() -> None:
     words = dict.fromkeys(("size", "row", "rows", "target", "joint", "beside", "where", "them"), "x")
-    words |= dict.fromkeys(("parameter", "option", "advice"), "x")
+    words |= dict.fromkeys(("parameter", "option", "advice", "first"), "x")
     for code, row in TABLE.items():
         assert code == row.code and row.kind in ("fine", "gross", "both") and row.tried
         for text in (row.text.format(**words), row.advice.format(**words)):
@@ -298,6 +298,7 @@ GROSS = {
         {"code": "units", "advice": "add --millimetres, and add --degrees"},
     ),
     "sign": (lambda q, p: (turned(q, 1, -q[:, 1]), p), {"code": "sign", "joint": 1}),
+    "signs": (lambda q, p: (-q, p), {"code": "signs"}),
     "zero": (lambda q, p: (turned(q, 1, q[:, 1] - np.pi / 2), p), {"code": "zero", "joint": 1, "size": 90.0}),
     "couple": (
         lambda q, p: (turned(q, 1, q[:, 1] + q[:, 0]), p),
@@ -329,6 +330,13 @@ def test_a_gross_mistake_is_named(mistake: str, name: str) -> None:
     assert {k: getattr(told, k) for k in wanted} == wanted, told.text
     assert told.material and told.probability < SIGNIFICANT
     json.dumps(asdict(told), allow_nan=False)
+
+
+@pytest.mark.parametrize("order", [(1, 0, 2), (0, 2, 1)])
+def test_points_of_a_left_handed_frame_are_named(order: tuple[int, int, int]) -> None:
+    one = cell(2, 1, 24)
+    told = explain_gross(one.asked, one.data((one.points() + one.noise)[..., order]))
+    assert told is not None and told.code == "mirror" and "left-handed" in told.text
 
 
 def test_exchanged_targets_are_named_where_their_places_are_known() -> None:

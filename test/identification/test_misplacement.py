@@ -40,6 +40,14 @@ def test_what_stands_elsewhere_is_named(base: bool, tool: bool, gross: int, seed
     assert answer.after < 0.01 and (answer.before > 0.02) == (base or tool)
 
 
+def test_a_reversed_joint_is_no_matter_of_places() -> None:
+    robot, data = measured(True, True, 0)
+    q = data.q * [1, -1, 1, 1, 1, 1]
+    answer = find_misplacement(robot, Measurements(robot.joint_names, q, data.p))
+    assert answer.unknown == () and answer.unexplained
+    assert not find_misplacement(robot, data).unexplained
+
+
 def test_too_few_points_say_nothing() -> None:
     robot, data = measured(True, True, 0)
     few = data.select(np.arange(3))
