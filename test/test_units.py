@@ -39,6 +39,7 @@ def test_decimal_units_are_exact() -> None:
     for digits in (3, 7, 20, 57, 123, 999):
         assert quantity(f"{digits}um") == float(f"{digits}e-6")
         assert quantity(f"{digits}mm") == float(f"{digits}e-3")
+        assert quantity(f"{digits / 100}mm") == float(f"{digits / 100}e-3")
 
 
 @pytest.mark.parametrize("text", ["", "mm", "1 2", "1 ft", "1mm2", "0,5mm", "1e", "0x10", "1_000", "--1", "1m m"])

@@ -13,7 +13,7 @@ import numpy as np
 from calib_planner.arrays import FloatArray, check_number
 from calib_planner.cli.terminal import Terminal
 from calib_planner.errors import InputError
-from calib_planner.io import angle_factors
+from calib_planner.io import angle_factors, shipped_robots
 from calib_planner.robot import Coupling, Robot, check_reflectors, parse_coupling
 from calib_planner.tracker import Isotropic
 from calib_planner.units import UNSAID, Units, length, quantity
@@ -33,10 +33,10 @@ ERROR_MODEL = "typical"
 KNOWN = "none"
 """Value of --unknown for a base and targets that are as the robot and --targets say."""
 SIGMA = 3e-5
+"""Standard deviation of one coordinate of a laser tracker, where nothing else is said [m]."""
 COARSE = 5e-3
 """An instrument that errs by more [m] is told: robots err less before they are calibrated. It is no error, since
 plans are the same whatever the scale of σ."""
-"""Standard deviation of one coordinate of a laser tracker, where nothing else is said [m]."""
 
 
 def add_command(
@@ -274,6 +274,22 @@ def load_robot(args: argparse.Namespace) -> Robot:
     return robot
 
 
+def load_planned_robot(args: argparse.Namespace, planned: str) -> Robot:
+    """The robot of --robot, else ``planned``, the one that the plan names, which has to be a shipped one."""
+    if args.robot is None and planned not in shipped_robots():
+        advice = f"state --robot FILE or --cell FILE: the plan holds no more of {planned} than its name"
+        raise InputError("--robot", "nothing", f"the file of {planned}", advice)
+    args.robot = args.robot or planned
+    return load_robot(args)
+
+
+def tell_coarse(source: str, sigma: float, args: argparse.Namespace) -> None:
+    """Say that an instrument with ``sigma`` [m], as ``source`` has it, is too coarse to be true."""
+    if sigma > COARSE:
+        said = f"{source}: {length(sigma)} in each coordinate is more than robots err by: millimetres?"
+        Terminal(json_wanted=args.json).note(said)
+
+
 def choose_parameters(robot: Robot, args: argparse.Namespace) -> Robot:
     """The robot with the active parameters of ``add_parameters``."""
     request = args.parameters or robot.parameter_names
@@ -404,10 +420,7 @@ def conditions(args: argparse.Namespace, robot: Robot) -> dict[str, Any]:
     from calib_planner.io import read_constraints, read_instrument
 
     noise = Isotropic(args.sigma) if args.instrument is None else read_instrument(args.instrument)
-    if noise.typical > COARSE:
-        source = "--sigma" if args.instrument is None else args.instrument
-        said = f"{source}: {length(noise.typical)} in each coordinate is more than robots err by: millimetres?"
-        Terminal(json_wanted=args.json).note(said)
+    tell_coarse("--sigma" if args.instrument is None else args.instrument, noise.typical, args)
     if args.constraints is None:
         return {"noise": noise}
     return {"noise": noise, "constraints": read_constraints(args.constraints, robot)}

@@ -139,7 +139,15 @@ def _terms(estimate: Estimate) -> Table:
 def _noise(estimate: Estimate) -> str:
     """Noise of a point, in one line."""
     noise = estimate.noise
-    return f"Noise per coordinate of a point: {length(noise.sigma)} ({NOISE_SOURCES[noise.source]})."
+    return f"Noise per coordinate of a point: {length(noise.sigma)} ({noise_source(estimate)})."
+
+
+def noise_source(estimate: Estimate) -> str:
+    """Who says how large the noise of a point is: beside a statement, the residuals may say that it is larger."""
+    words = NOISE_SOURCES[estimate.noise.source]
+    if estimate.noise.source == "residuals" or estimate.knowledge.model.is_papers:
+        return words
+    return f"{words}, with what the residuals show beyond it"
 
 
 def _accuracy(estimate: Estimate) -> str:

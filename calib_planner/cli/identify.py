@@ -31,6 +31,7 @@ from calib_planner.cli.arguments import (
     option,
     reading_of,
     switch,
+    tell_coarse,
     test_poses,
 )
 from calib_planner.cli.estimate_table import show_estimate
@@ -127,6 +128,8 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
 def _problem(
     robot: Robot, sources: Sources, args: argparse.Namespace, terminal: Terminal
 ) -> IdentificationProblem:
+    if args.sigma is not None:
+        tell_coarse("--sigma", args.sigma, args)
     model = error_model_of(args, args.error_model, robot, sources.data)
     if args.prior == TYPICAL:
         model = with_tolerances(model)

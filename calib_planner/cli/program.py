@@ -10,7 +10,15 @@ import numpy as np
 from rich.console import Console
 
 from calib_planner.arrays import FloatArray, plain
-from calib_planner.cli.arguments import Commands, add_command, add_robot, load_robot, numbers, option, rows
+from calib_planner.cli.arguments import (
+    Commands,
+    add_command,
+    add_robot,
+    load_planned_robot,
+    numbers,
+    option,
+    rows,
+)
 from calib_planner.cli.terminal import Terminal
 from calib_planner.io import (
     HANDSHAKES,
@@ -74,8 +82,7 @@ def add(commands: Commands, summary: str) -> None:
 def run(args: argparse.Namespace, terminal: Terminal) -> None:
     form = read_program_format(args.form)
     plan = read_plan(args.plan)
-    args.robot = plan.robot if args.robot is None else args.robot
-    robot = load_robot(args)
+    robot = load_planned_robot(args, plan.robot)
     constraints = () if args.constraints is None else read_constraints(args.constraints, robot)
     sheet = plan_sheet(plan, robot, constraints)
     settings = _settings(args, robot)

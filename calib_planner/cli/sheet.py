@@ -16,7 +16,7 @@ from calib_planner.cli.arguments import (
     add_pace,
     add_robot,
     chosen_pace,
-    load_robot,
+    load_planned_robot,
     option,
     start_of,
 )
@@ -57,8 +57,7 @@ def run(args: argparse.Namespace, terminal: Terminal) -> None:
         advice = "a CSV of configurations carries no accuracy; write the plan with --output plan.yaml"
         raise FileFormatError(args.plan, "file", "another kind of file", "a plan .yaml", advice)
     plan = read_plan(args.plan)
-    args.robot = plan.robot if args.robot is None else args.robot
-    robot = load_robot(args)
+    robot = load_planned_robot(args, plan.robot)
     sheet = plan_sheet(
         plan,
         robot,
@@ -122,9 +121,9 @@ def _visits(sheet: PlanSheet) -> Table:
     turns = sheet.robot.joint_is_revolute
     for name, turning in zip(sheet.plan.joint_names, turns, strict=True):
         table.add_column(f"{name}\n[{joint_unit(turning)}]", justify="right", overflow="fold")
-    for heading in ("times\nmin:s", "travel\nmax", "reach", "visible"):
+    visible = sheet.checks.visible  # a column of nothing but "not checked" is left to the line below the table
+    for heading in ("times\nmin:s", "travel\nmax", "reach", "visible")[: 3 if visible is None else 4]:
         table.add_column(heading, justify="right", overflow="fold")
-    visible = sheet.checks.visible
     for i, row in enumerate(sheet.degrees):
         arrival = round(sheet.timetable.arrive[i])
         table.add_row(
@@ -133,7 +132,7 @@ def _visits(sheet: PlanSheet) -> Table:
             f"{sheet.plan.repetitions[i]}×\n{arrival // 60}:{arrival % 60:02d}",
             _travel(sheet, i),
             WORDS[bool(sheet.checks.reachable[i])],
-            WORDS[None if visible is None else bool(visible[i])],
+            *(() if visible is None else (WORDS[bool(visible[i])],)),
         )
     return table
 

@@ -242,6 +242,8 @@ def find_misplacement(robot: Robot, data: Measurements) -> Misplacement:
 
 
 def _median(robot: Robot, data: Measurements) -> float:
-    """Median distance of the points from where ``robot`` has them [m]."""
+    """Median distance of the points from where ``robot`` has them [m]; NaN without points."""
+    if not data.seen.any():
+        return float("nan")
     points = replace(robot, parameter_names=()).positions(data.q)
     return float(np.median(np.linalg.norm(data.p - points, axis=2)[data.seen]))

@@ -107,6 +107,9 @@ def load_robot(source: str | Path, *, base_link: str | None = None, tip_link: st
         path = config_folder() / "robots" / f"{source}.yaml"
     suffix = path.suffix.lower()
     if not path.is_file() or suffix not in (*YAML_SUFFIXES, *URDF_SUFFIXES):
+        if path.is_file():
+            kinds = ", ".join((*URDF_SUFFIXES, *YAML_SUFFIXES))
+            raise InputError("robot", source, f"a file of a robot, whose name ends in one of {kinds}")
         raise UnknownNameError(
             "robot", str(source), [*shipped_robots(), "PATH.urdf", "PATH.yaml (an existing file)"]
         )

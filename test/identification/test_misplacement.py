@@ -52,3 +52,10 @@ def test_too_few_points_say_nothing() -> None:
     robot, data = measured(True, True, 0)
     few = data.select(np.arange(3))
     assert find_misplacement(robot, few).unknown == ()
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_points_say_nothing() -> None:
+    robot, data = measured(True, True, 0)
+    none = Measurements(robot.joint_names, data.q, np.full(data.p.shape, np.nan))
+    assert find_misplacement(robot, none).unknown == () and not find_misplacement(robot, none).unexplained

@@ -105,6 +105,12 @@ def test_unknown_robot():
         Robot.load("kuka_kr27")
 
 
+def test_a_file_of_another_kind_is_no_unknown_name(tmp_path):
+    (tmp_path / "points.csv").write_text("j1,x1,y1,z1\n")
+    with pytest.raises(InputError, match=r"ends in one of \.urdf.*\.yaml.*points\.csv"):
+        Robot.load(tmp_path / "points.csv")
+
+
 YAML_HEAD = "joints: [{name: q1, lower: -1, upper: 1}]\nelements: [{type: Rz, joint: q1}]\n"
 
 
