@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib_planner.error_model import MEANINGS
-from calib_planner.identification import NOISE_SOURCES, Estimate, LeftOutError, Reason, Validation
+from calib_planner.identification import Estimate, LeftOutError, Reason, Validation
 from calib_planner.measurements import RejectedPoint
 from calib_planner.robot import is_nuisance
 from calib_planner.units import counted, length, milli, signed
@@ -139,15 +139,7 @@ def _terms(estimate: Estimate) -> Table:
 def _noise(estimate: Estimate) -> str:
     """Noise of a point, in one line."""
     noise = estimate.noise
-    return f"Noise per coordinate of a point: {length(noise.sigma)} ({noise_source(estimate)})."
-
-
-def noise_source(estimate: Estimate) -> str:
-    """Who says how large the noise of a point is: beside a statement, the residuals may say that it is larger."""
-    words = NOISE_SOURCES[estimate.noise.source]
-    if estimate.noise.source == "residuals" or estimate.knowledge.model.is_papers:
-        return words
-    return f"{words}, with what the residuals show beyond it"
+    return f"Noise per coordinate of a point: {length(noise.sigma)} ({estimate.noise_source})."
 
 
 def _accuracy(estimate: Estimate) -> str:

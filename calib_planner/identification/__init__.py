@@ -8,7 +8,6 @@ from calib_planner.identification.doubt import gate_of
 from calib_planner.identification.estimate import (
     FOREMOST,
     LEVELS,
-    NOISE_SOURCES,
     STATUS,
     STRONG,
     Accuracy,

@@ -558,6 +558,14 @@ class Estimate(Told):
         return plain_result
 
     @property
+    def noise_source(self) -> str:
+        """Who says how large the noise of a point is, in words: the residuals may add to what was stated."""
+        words = NOISE_SOURCES[self.noise.source]
+        if self.noise.source == "residuals" or self.knowledge.model.is_papers:
+            return words
+        return f"{words}, with what the residuals show beyond it"
+
+    @property
     def placement_values(self) -> FloatArray:
         """(P,) values of the parameters in ``calibrated`` [m | rad]."""
         by_name = {p.name: p.nominal for p in self.calibrated.parameters}

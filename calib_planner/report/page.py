@@ -15,7 +15,7 @@ from typing import Any
 from markupsafe import Markup
 
 from calib_planner.error_model import MEANINGS
-from calib_planner.identification import FOREMOST, NOISE_SOURCES, STRONG, Estimate, IdentificationProblem
+from calib_planner.identification import FOREMOST, STRONG, Estimate, IdentificationProblem
 from calib_planner.io import URDF_SUFFIXES, write_text
 from calib_planner.report import charts
 from calib_planner.report.calibration import CalibrationReport, Provenance, calibration_report
@@ -74,7 +74,7 @@ def report_page(report: CalibrationReport) -> str:
         advice=advice,
         sets=charts.compared_sets(report.estimate),
         frame=FRAMES[data["estimate"]["accuracy_frame"]],
-        source=NOISE_SOURCES[report.estimate.noise.source],
+        source=report.estimate.noise_source,
         meanings=MEANINGS,
         deflection_marks=charts.deflection_marks(report.estimate),
         papers=report.estimate.knowledge.model.is_papers,

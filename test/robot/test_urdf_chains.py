@@ -369,6 +369,8 @@ def test_a_plain_urdf_may_be_called_xacro_and_have_a_byte_order_mark(tmp_path):
 
 def test_other_files_and_links_beside_a_yaml():
     with pytest.raises(UnknownNameError, match=r"PATH\.urdf"):
+        Robot.load("nowhere.urdf")
+    with pytest.raises(InputError, match=r"ends in one of \.urdf"):
         Robot.load(__file__)
     for links in ({"base_link": "base"}, {"tip_link": "tool0"}):
         with pytest.raises(InputError, match="only beside a URDF") as caught:
