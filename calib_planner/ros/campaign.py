@@ -33,10 +33,11 @@ from calib_planner.campaign import (
 )
 from calib_planner.errors import InputError
 from calib_planner.io import read_error_model, write_estimate, write_measurements
+from calib_planner.measurements import configuration_labels
 from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.messages import estimate_to_message, plan_to_message, reasons_of
+from calib_planner.ros.messages import NAN, estimate_to_message, in_ros, plan_to_message, reasons_of
 from calib_planner.ros.model import Model, NotReady, with_targets
 from calib_planner.ros.planning import constraints_of
 from calib_planner.ros.session import confined
@@ -383,12 +384,19 @@ def _joints(message: Measurement, state: CampaignState) -> FloatArray:
 FIELD = "store_folder"
 
 
-def result_message(result: CampaignResult, campaign_id: str) -> CalibrationEstimate | None:
+def result_message(result: CampaignResult, campaign_id: str, frame_id: str) -> CalibrationEstimate | None:
     """The estimate of the fit with the campaign's verdict, without stamp; ``None`` if there is none."""
     if result.estimate is None or result.fit is None:
         return None
-    others = {"verdict": result.verdict.level, "reasons": reasons_of(result.verdict), "plan_id": campaign_id}
-    return estimate_to_message(result.estimate, complete=result.outcome == "reached", **others)
+    return estimate_to_message(
+        result.estimate,
+        frame_id,
+        plan_id=campaign_id,
+        configurations=len(np.unique(configuration_labels(result.fit.q))),
+        complete=result.outcome == "reached",
+        verdict=result.verdict.level,
+        reasons=reasons_of(result.verdict),
+    )
 
 
 def write_result(folder: str, result: CampaignResult, campaign_id: str) -> None:
@@ -412,7 +420,6 @@ OUTCOME = {
     "unreachable": CampaignStatus.OUTCOME_UNREACHABLE,
     "failed": CampaignStatus.OUTCOME_FAILED,
 }
-NAN = float("nan")
 
 
 def idle_status(reason: str) -> CampaignStatus:
@@ -451,9 +458,9 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
         validation_rms=NAN,
         validation_predicted=NAN,
         round_measured=[r.measured for r in state.rounds],
-        round_accuracy=[r.accuracy for r in state.rounds],
+        round_accuracy=[r.accuracy if math.isfinite(r.accuracy) else NAN for r in state.rounds],
         joint_names=list(problem.robot.joint_names),
-        reason=cut("; ".join(filter(None, (waiting, reason, state.message)))),
+        reason=cut(in_ros("; ".join(filter(None, (waiting, reason, state.message))))),
     )
     if isinstance(action, Measure):
         message.configuration_index, message.configuration = action.index, action.q.tolist()

@@ -6,6 +6,7 @@ the library's own errors, with the message's field in ``InputError.field``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ from calib_planner.units import brief
 MOST_ROWS = 10_000
 """Largest number of configurations or test poses taken from a message."""
 MOST_REPETITIONS = 100_000
+NAN = float("nan")
+"""Not known."""
 
 PLAN_STATUS = {word: getattr(PlanMessage, f"STATUS_{word.upper()}") for word in (*PLAN_WORDS, "empty")}
 ESTIMATE_STATUS = {
@@ -41,12 +44,40 @@ ESTIMATE_STATUS = {
     "not_converged": CalibrationEstimate.STATUS_NOT_CONVERGED,
     "error": CalibrationEstimate.STATUS_ERROR,
 }
+IN_ROS: tuple[tuple[str, str], ...] = (
+    (r"add --couple (\S+)", r"declare the coupling \1 in the robot's YAML (couple:)"),
+    (r"add --unknown (\S+)", r"set the parameter unknown to \1"),
+    (r"add --millimetres|add --units \S+", "publish the points in metres"),
+    (r"leave out --millimetres if the points are", "publish the points"),
+    (r"(add|leave out) --degrees", "publish the joint positions in radians"),
+    (
+        r"calib-planner plan --measured … --accuracy …",
+        "request a plan of more, or begin a campaign (campaign_node)",
+    ),
+    (r" \(--parameters full\)", " (parameter parameters: full)"),
+    (r"use the robust loss \(--loss robust\)", "withdraw them (~/undo_measurement)"),
+    (r", ask for it \(--prove\)", ""),
+    (r" \(--base-link, --tip-link\)", ""),
+    (r" \(--tip-link\)", " (parameter tip_link)"),
+)
+"""Pattern of an advice for the command line → what a user of the nodes does."""
+
+ESTIMATE_NUMBERS = ("condition", "sigma_estimate", "residual_rms_before", "residual_rms_after", "left_out_rms",
+                    "left_out_predicted_rms")  # fmt: skip
+"""Numbers of an estimate that are not known while there is none."""
 PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency", "seconds")
 """Fields of ``PlanQuality`` and of the message that are the same number."""
 MEASUREMENT_STATUS = {
     word: getattr(Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}")
     for word in DECISIONS
 }
+
+
+def in_ros(text: str) -> str:
+    """A text of the library for a message: its advice names parameters and services, not options of commands."""
+    for pattern, replacement in IN_ROS:
+        text = re.sub(pattern, replacement, text)
+    return text
 
 
 def nanoseconds(stamp: Time) -> int:
@@ -88,11 +119,17 @@ def plan_to_message(plan: Plan, plan_id: str, stamp: int, frame_id: str) -> Plan
         predicted_accuracy_per_test_pose=quality.predicted_accuracy_per_test_pose.tolist(),
         seed=int(quality.seed) % 2**32,
         status=PLAN_STATUS[quality.status],
-        **{name: getattr(quality, name) for name in ("criterion", "bound", "message")},
+        message=in_ros(quality.message),
+        **{name: getattr(quality, name) for name in ("criterion", "bound")},
         **{name: float(getattr(quality, name)) for name in PLAN_NUMBERS},
     )
     message.header.stamp, message.header.frame_id = stamp_message(stamp), frame_id
     return message
+
+
+def no_plan() -> PlanMessage:
+    """The plan of an answer that has none."""
+    return PlanMessage(status=PLAN_STATUS["empty"], **dict.fromkeys(PLAN_NUMBERS[:3], NAN))
 
 
 def plan_from_message(message: PlanMessage) -> ReceivedPlan:
@@ -233,8 +270,14 @@ class ReceivedEstimate:
     sigma_estimate: float
 
 
-def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
-    """An ``Estimate`` as message; ``others`` sets further fields (``plan_id``, ``condition``, …)."""
+def estimate_to_message(estimate: Any, frame_id: str, **others: Any) -> CalibrationEstimate:
+    """An ``Estimate`` as message, without stamp.
+
+    Args:
+        estimate: The estimate.
+        frame_id: The robot's base frame.
+        others: Further fields (``plan_id``, ``condition``, …).
+    """
     numbers = {
         "nominal": estimate.fit.nominal,
         "value": estimate.fit.values,
@@ -263,18 +306,20 @@ def estimate_to_message(estimate: Any, **others: Any) -> CalibrationEstimate:
         "term_sizes": [float(t.size) for t in used],
         "accuracy_frame": estimate.accuracy.frame,
         "status": ESTIMATE_STATUS[estimate.fit.status],
-        "message": estimate.fit.message,
-        "condition": float("nan"),
+        "message": in_ros(estimate.fit.message),
+        "condition": NAN,
         "outliers": len(estimate.points.rejected),
         "verdict": estimate.verdict.level,
         "reasons": reasons_of(estimate.verdict),
     }
-    return CalibrationEstimate(**(fields | others))
+    message = CalibrationEstimate(**(fields | others))
+    message.header.frame_id = frame_id
+    return message
 
 
 def reasons_of(verdict: Verdict) -> list[str]:
     """The reasons of a verdict as lines, each with what to do."""
-    return [f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}" for r in verdict.reasons]
+    return [in_ros(f"{r.level}: {r.text}{'; ' * bool(r.advice)}{r.advice}") for r in verdict.reasons]
 
 
 def estimate_from_message(message: CalibrationEstimate) -> ReceivedEstimate:
@@ -301,23 +346,23 @@ def pace_of(
     return Pace(np.minimum(wanted, limits), dwell, text, settle)
 
 
-def trajectory_message(plan: Plan, robot: Robot, pace: Pace, stamp: int, frame_id: str) -> JointTrajectory:
+def trajectory_message(plan: Plan, robot: Robot, pace: Pace, frame_id: str) -> JointTrajectory:
     """A plan for a controller: at every visit a point of arrival and one of departure, at rest as all points.
 
-    Before a further visit to the same configuration there is a point aside.
+    Before a further visit to the same configuration there is a point aside. The stamp is zero: a controller
+    starts when it gets the trajectory. Another stamp is the time to start at, for which it would be late.
 
     Args:
         plan: Its configurations [rad | m], in the order of visiting.
         robot: Its limits bound the way to the first configuration, whose beginning is unknown.
         pace: Speeds and standstill; without a standstill there is no point of departure.
-        stamp: Stamp of the header [ns].
         frame_id: Frame of the header.
 
     Raises:
         InputError: The tour takes longer than a ROS duration can hold.
     """
     result = JointTrajectory(joint_names=list(plan.joint_names))
-    result.header.stamp, result.header.frame_id = stamp_message(stamp), frame_id
+    result.header.frame_id = frame_id
     for q, after in timetable(plan, robot, pace).points(plan.configurations):
         point = JointTrajectoryPoint(positions=q, velocities=[0.0] * len(q))
         point.time_from_start = Duration(sec=after // NANO, nanosec=after % NANO)

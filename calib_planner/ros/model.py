@@ -25,6 +25,7 @@ from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_t
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.messages import in_ros
 from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.settings import IdentifierParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
@@ -173,7 +174,7 @@ class ModelSource:
         try:
             model = described_model(text, self._settings.base_link, self._settings.tip_link)
         except CalibPlannerError as error:
-            self.refusal = f"{TOPIC} refused: {cut(error, 800)}"
+            self.refusal = f"{TOPIC} refused: {cut(in_ros(str(error)), 800)}"
             if isinstance(self.model, Model):
                 self.refusal += f"; {self.model.robot.name} stays the robot"
             else:

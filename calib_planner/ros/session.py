@@ -53,7 +53,7 @@ from calib_planner.io import (
     write_measurements,
     write_text,
 )
-from calib_planner.measurements import Measurements
+from calib_planner.measurements import Measurements, configuration_labels
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.units import brief, cut, listed
@@ -262,6 +262,13 @@ class Session:
     def done(self) -> Counter[int | None]:
         """Accepted measurements per row of the plan."""
         return Counter(r.index for r in self.accepted)
+
+    @property
+    def configurations(self) -> int:
+        """Number of different configurations of the accepted measurements, those of no plan included."""
+        unplanned = [r.standstill.joints for r in self.accepted if r.index is None]
+        planned = len({r.index for r in self.accepted} - {None})
+        return planned + (len(np.unique(configuration_labels(np.array(unplanned)))) if unplanned else 0)
 
     def missing(self) -> list[int]:
         """Rows of the plan that were not measured as often as planned, in its order."""

@@ -30,6 +30,7 @@ UNKNOWN = "what else is unknown: base, tool or base,tool"
 CONSTRAINTS = "what may be measured: name of a file in constraints_folder; empty = joint limits only"
 ERROR_MODEL = "how the robot errs: typical, paper (noise alone), or the path of a YAML file, also an estimate"
 FRAME = "accuracy at the test poses: in the frame of the points (world), or up to a rigid motion (robot)"
+BASE_FRAME = "name of the robot's base frame"
 TOPICS = "topics of the tracker's points, one per target"
 LARGEST_SEED = 2**31 - 1
 
@@ -65,7 +66,7 @@ class PlanParameters(RobotParameters):
     constraints: str = parameter("", CONSTRAINTS)
     constraints_folder: str = parameter("", "folder of constraints; empty = the package's config", read_only=True)
     time_limit: float = parameter(60.0, "longest search of a plan", "s", 0.01, 86400.0)
-    frame_id: str = parameter("base_link", "name of the robot's base frame")
+    frame_id: str = parameter("base_link", BASE_FRAME)
 
     def __post_init__(self) -> None:
         for word in unknown_words(self.unknown):
@@ -115,6 +116,7 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
     )
     error_model: str = at_configure("typical", ERROR_MODEL)
     accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
+    frame_id: str = parameter("base_link", BASE_FRAME)
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
     plan_topic: str = at_configure("calibration_planner/current_plan", "topic of the plan")
     plan_tolerance: float = parameter(

@@ -118,8 +118,8 @@ def make_tour(
         speed: Largest joint speed [rad/s | m/s].
         dwell: Length of a standstill [s].
         coupling: (n, n) of a robot that shows joints against others, see ``Robot.coupling``.
-        shortest: Least length of a move [s]; if it is a period of the joint states, at least one of them shows that
-            the robot backed off, whatever the speed.
+        shortest: Least length of a move [s]; if it is a period of the joint states, at least one of them shows
+            that the robot backed off, whatever the speed.
     """
     phases: list[Phase] = []
     here, now = frozen(start), 0.0

@@ -97,6 +97,10 @@ class FakeCell(Node):
         goal.succeed()
         return kind(status=kind.SUCCESS, executed=1)
 
+    def point_at(self, q: np.ndarray) -> np.ndarray:
+        """(3,) what the tracker measures at ``q`` (joints,) [m]."""
+        return self.cell.truth.positions(q[None])[0, 0] + 1e-5 * self._rng.standard_normal(3)
+
     def publish(
         self, q: np.ndarray, *, accepted: bool = True, number: int | None = None, **others: object
     ) -> None:
@@ -104,7 +108,7 @@ class FakeCell(Node):
         plan = self._plan
         rows = plan_from_message(plan).plan.configurations
         self.number = self.number + 1 if number is None else number
-        point = self.cell.truth.positions(q[None])[0, 0] + 1e-5 * self._rng.standard_normal(3)
+        point = self.point_at(q)
         message = Measurement(
             id=self.number,
             plan_id=plan.plan_id,

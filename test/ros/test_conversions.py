@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,7 +19,9 @@ from calib_planner.acquisition import Rejection, RejectionReason, Standstill, pi
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.identification import STATUS as LIBRARY_ESTIMATE_STATUS
+from calib_planner.identification import alternatives, verdict
 from calib_planner.planning import Search
+from calib_planner.planning.certify.prove import PROOF_STATUS
 from calib_planner.planning.result import STATUS as LIBRARY_PLAN_STATUS
 from calib_planner.ros import messages as c
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -169,7 +172,8 @@ def test_estimate_there_and_back(robot: Robot, planned: Plan) -> None:
     cell = SimulatedCell(robot, random_deviations(robot, 1))
     data = cell.measure(planned.configurations, 2, 1)
     found = identify(IdentificationProblem(robot, data, test_poses=planned.test_poses))
-    message = c.estimate_to_message(found, plan_id="p", complete=True)
+    message = c.estimate_to_message(found, "base_link", plan_id="p", complete=True)
+    assert message.header.frame_id == "base_link"
     assert message.status == CalibrationEstimate.STATUS_OK and message.complete
     assert len(message.covariance) == len(message.parameters) ** 2
     assert message.left_out_rms == found.left_out.rms
@@ -196,4 +200,33 @@ def test_an_estimate_with_infinite_accuracy_travels(robot: Robot, planned: Plan)
         fit=replace(found.fit, std=np.full(4, np.nan)),
         accuracy=replace(found.accuracy, predicted=np.array([np.inf])),
     )
-    assert math.isinf(c.estimate_to_message(blind).predicted_accuracy[0])
+    assert math.isinf(c.estimate_to_message(blind, "base_link").predicted_accuracy[0])
+
+
+def test_what_a_message_advises_can_be_done_with_nodes() -> None:
+    """No text of a verdict, a test of alternatives or a proof names an option of a command; none is cut."""
+    texts = [text for _, said, advice in verdict._TABLE for text in (said, *advice.values())]
+    texts += [text for rows in alternatives.TABLE.values() for text in (rows.text, rows.advice)]
+    texts += [
+        *PROOF_STATUS.values(),
+        "add --units cm, and add --degrees",
+        "leave out --degrees",
+        "add --millimetres",
+    ]
+    texts += ["leave out --millimetres if the points are in metres, or give the robot's lengths in metres"]
+    named = [text for text in texts if "--" in text]
+    assert len(named) > 8
+    for text in named:
+        said = c.in_ros(text)
+        assert not re.search("--[a-z]", said) and len(said) > 0.5 * len(text), said
+    assert c.in_ros("add --couple j3+=j2 if the controller shows it so") == (
+        "declare the coupling j3+=j2 in the robot's YAML (couple:) if the controller shows it so"
+    )
+    untouched = [text for text in texts if "--" not in text and "calib-planner plan" not in text]
+    assert [c.in_ros(text) for text in untouched] == untouched
+
+
+def test_an_answer_without_a_plan_has_no_numbers() -> None:
+    message = c.no_plan()
+    assert message.status == PlanMessage.STATUS_EMPTY
+    assert all(math.isnan(getattr(message, name)) for name in ("predicted_accuracy", "lower_bound", "efficiency"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
 from rclpy.serialization import deserialize_message, serialize_message
 from robots import mixed, plan_of, random_configurations
 from visualization_msgs.msg import Marker, MarkerArray
@@ -113,13 +113,14 @@ def test_no_joint_is_ever_too_fast(robot: Robot, dwell: float) -> None:
     plan = planned(robot, 7)
     count = len(robot.joint_names)
     limits = np.where(np.arange(count) == 1, 0.05, np.inf)
-    message = trajectory_message(plan, robot, pace_of(robot, 0.5, 0.1, limits, dwell), STAMP, "base")
+    message = trajectory_message(plan, robot, pace_of(robot, 0.5, 0.1, limits, dwell), "base")
     each = 2 if dwell else 1
     q = np.array([p.positions for p in message.points])
     times = np.array([seconds(p.time_from_start) for p in message.points])
     # Two visits to each: there, aside, and there again.
     np.testing.assert_array_equal(q[:: 2 * each + 1], plan.configurations)
     assert message.joint_names == list(robot.joint_names) and message.header.frame_id == "base"
+    assert message.header.stamp == Time()  # another one would be a time to start at
     speeds = np.minimum(np.where(robot.joint_is_revolute, 0.5, 0.1), limits)
     moved, took = np.abs(np.diff(q, axis=0)), np.diff(times)
     assert (moved <= speeds * took[:, None] + 1e-9).all()
@@ -136,4 +137,4 @@ def test_a_tour_of_a_century_is_refused() -> None:
     robot = Robot.load("kuka_kr270")
     pace = pace_of(robot, 1e-3, 1e-4, np.full(6, 1e-9), 3600.0)
     with pytest.raises(InputError, match="timetable"):
-        trajectory_message(planned(robot, 3), robot, pace, STAMP, "base")
+        trajectory_message(planned(robot, 3), robot, pace, "base")

@@ -113,7 +113,7 @@ def test_a_plan_for_a_time_keeps_it_unless_the_request_says_how_many() -> None:
     assert own.plan is not None and own.plan.measurements > len(own.plan.configurations)
     pace = plan_pace(settings, OWN)
     assert 180.0 < timetable(own.plan, OWN.robot, pace).seconds <= 200.0
-    points = trajectory_message(own.plan, OWN.robot, pace, 0, "base").points
+    points = trajectory_message(own.plan, OWN.robot, pace, "base").points
     assert points[-1].time_from_start.sec <= 200
     counted = answer(PlanCalibration.Request(test_poses=POSE, configurations=3), settings, OWN).plan
     assert counted is not None and counted.measurements == 3

@@ -307,7 +307,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self.get_logger().info(f"{result.outcome}: {result.message}")
         for reason in reasons_of(result.verdict) or [result.verdict.level]:
             self.get_logger().info(reason)
-        message = result_message(result, self._id)
+        message = result_message(result, self._id, self.settings.value.frame_id)
         if message is not None:
             message.header.stamp = stamp_message(self.now)
             self._estimates.publish(message)

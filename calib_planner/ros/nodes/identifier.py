@@ -42,9 +42,12 @@ from calib_planner.ros import session as saving
 from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import (
+    ESTIMATE_NUMBERS,
     ESTIMATE_STATUS,
+    NAN,
     ReceivedPlan,
     estimate_to_message,
+    in_ros,
     measurement_message,
     plan_from_message,
     stamp_message,
@@ -87,27 +90,26 @@ class IdentifierOutput:
         self._measurements.publish(message)
         self._log().info(f"configuration {record.index}: {record.status} {record.reason}".rstrip())
 
-    def estimate(self, session: Session, estimate: Estimate | TooFew) -> None:
-        """The estimate, or why there is none."""
+    def estimate(self, session: Session, estimate: Estimate | TooFew, frame_id: str) -> None:
+        """The estimate, or why there is none; ``frame_id`` is the robot's base."""
         others = {
             "plan_id": session.plan_id,
-            "configurations": len(session.done()),
+            "configurations": session.configurations,
             "rejected": session.rejections.total(),
             "complete": session.complete,
         }
         if isinstance(estimate, Estimate):
-            message = estimate_to_message(estimate, condition=condition_of(estimate), **others)
+            message = estimate_to_message(estimate, frame_id, condition=condition_of(estimate), **others)
         else:
             message = CalibrationEstimate(
                 robot=session.robot.name,
                 measurements=sum(int((r.standstill.samples > 0).sum()) for r in session.accepted),
-                condition=float("nan"),
-                left_out_rms=float("nan"),
-                left_out_predicted_rms=float("nan"),
                 status=ESTIMATE_STATUS["too_few" if estimate.missing else "error"],
-                message=estimate.message,
+                message=in_ros(estimate.message),
+                **dict.fromkeys(ESTIMATE_NUMBERS, NAN),
                 **others,
             )
+            message.header.frame_id = frame_id
             if not estimate.missing:
                 self._log().error(estimate.message)
         message.header.stamp = stamp_message(session.records[-1].acquired.end if session.records else 0)
@@ -222,7 +224,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             self._replace_session(heard)
         except CalibPlannerError as error:
             self.get_logger().error(f"{TOPIC} refused: {cut(error)}", throttle_duration_sec=1.0)
-            self._waiting = f"{TOPIC} refused: {cut(error, 800)}"
+            self._waiting = f"{TOPIC} refused: {cut(in_ros(str(error)), 800)}"
             return
         self.get_logger().info(f"{TOPIC}: {heard.robot.name}, joints {', '.join(heard.robot.joint_names)}")
 
@@ -338,7 +340,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             return
         estimate = session.estimate(self._how)
         changed = session.judge()
-        self._output.estimate(session, estimate)
+        self._output.estimate(session, estimate, self.settings.value.frame_id)
         for record in changed:
             self._output.record(session, record)
         self._output.description("" if self._model is None else self._model.urdf, estimate)

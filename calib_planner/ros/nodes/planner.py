@@ -28,7 +28,7 @@ from calib_planner.errors import CalibPlannerError
 from calib_planner.planning import Progress
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.markers import plan_markers
-from calib_planner.ros.messages import plan_to_message, trajectory_message
+from calib_planner.ros.messages import in_ros, no_plan, plan_to_message, trajectory_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.planning import Answer, answer, constraints_of, plan_pace
@@ -145,9 +145,9 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         if not hasattr(type(response), result.status):  # a service cannot be cancelled: the node was deactivated
             result = Answer("NOT_READY", "", "the node was deactivated while it planned: activate it, ask again")
         response.status = getattr(type(response), result.status)
-        response.field, response.message = result.field, result.message
+        response.field, response.message = result.field, in_ros(result.message)
         if result.plan is None or result.model is None:
-            response.plan = PlanMessage(status=PlanMessage.STATUS_EMPTY)
+            response.plan = no_plan()
         else:
             settings, stamp = self.settings.value, self.now
             response.plan = plan_to_message(result.plan, uuid.uuid4().hex[:12], stamp, settings.frame_id)
@@ -167,7 +167,7 @@ class PlannerNode(ManagedNode[PlannerParameters]):
         _, trajectories, pictures = self._publishers_of
         pace = plan_pace(settings, result.model)
         try:
-            trajectories.publish(trajectory_message(made, robot, pace, stamp, settings.frame_id))
+            trajectories.publish(trajectory_message(made, robot, pace, settings.frame_id))
         except CalibPlannerError as error:
             self.get_logger().error(f"no ~/trajectory: {error}")
         pictures.publish(plan_markers(made, robot, stamp, settings.frame_id))
