@@ -87,9 +87,9 @@ def test_a_short_motion_is_seen_however_long_it_takes_to_think_of_it(
 ) -> None:
     """Backing off takes milliseconds here: begun before what was sampled already, nobody would see it."""
 
-    def slow(*args: Any) -> Tour:
+    def slow(*args: Any, **named: Any) -> Tour:
         time.sleep(0.2)
-        return make_tour(*args)
+        return make_tour(*args, **named)
 
     monkeypatch.setattr(simulator_node, "make_tour", slow)
     states = bench.hear(JointState, "joint_states", STREAM_IN)
