@@ -281,10 +281,9 @@ def _identifications() -> list[Case]:
         Case("identify", f"{planar} --output e.yaml", ("e.yaml",)),
         Case("identify_offsets", f"{planar} --parameters offsets --sigma 3e-5"),
         Case("identify_lengths", f"{kuka} --parameters lengths"),
-        Case("identify_named", f"{kuka} --parameters d1,q2,q3 --discrepancy off"),
-        Case("identify_repetitions", f"{again} --folds 5 --seed 3 --iterations 30 --starts 3"),
+        Case("identify_named", f"{kuka} --parameters d1,q2,q3 --error-model paper"),
+        Case("identify_repetitions", f"{again}"),
         Case("identify_instrument", f"{kuka} --instrument config/instruments/laser_tracker.yaml"),
-        Case("identify_no_corrections", f"{again} --joint-corrections off"),
         Case("identify_validate", f"{kuka} --validate kuka_new.csv --required-accuracy 5e-5"),
         Case("identify_test_pose", f"{kuka} --test-pose '0 -1 1.5 0 0.8 0' --test-pose '0.3 -1 1 0 0.5 0'"),
         Case("identify_prior", f"{kuka} --prior known.yaml"),
@@ -302,7 +301,7 @@ def _identifications() -> list[Case]:
             "--test-pose '0.3 -1 1 0 0.5 0' --test-pose '-0.4 -0.8 1.2 0.3 0.6 0'"
             " --test-pose '0.1 -1.3 0.9 1 0.7 0'",
         ),
-        Case("identify_rank", f"{arm} --sigma 3e-5 --starts 0"),
+        Case("identify_rank", f"{arm} --sigma 3e-5"),
         Case(
             "identify_with_tool",
             f"{arm} --prior arm_estimate.yaml --prior-includes tool --validate arm_held_out.csv",
@@ -314,9 +313,9 @@ def _identifications() -> list[Case]:
         Case(
             "identify_real_held_out",
             f"identify {IRB} --parameters offsets --unknown base,tool --data irb120.csv "
-            "--validate irb120_new.csv --validate-target-from 1 --joint-corrections off",
+            "--validate irb120_new.csv --validate-target-from 1",
         ),
-        Case("identify_real_stds", f"{ur10} --joint-corrections off --folds 3"),
+        Case("identify_real_stds", f"{ur10}"),
     ]
 
 
