@@ -27,7 +27,7 @@ from calib_planner.planning.bound import (
     maximised,
     raised,
 )
-from calib_planner.planning.certify.prove import USUAL_WORK, Proof, prove_bound
+from calib_planner.planning.certify.prove import CLOSELY, TOLERANCE, USUAL_WORK, Proof, prove_bound
 from calib_planner.planning.criteria import (
     POSE_CRITERIA,
     Compound,
@@ -283,8 +283,8 @@ def _proven(
     """
     request, proof = _design_problem(space, criterion), None
     if prove or request.candidates is not None or not request.feasibility.constraints:
-        work = float("inf") if prove else USUAL_WORK
-        design, proof = prove_bound(request, design, rng, most_work=work, cancel=clock.over)
+        work, tolerance = (float("inf"), CLOSELY) if prove else (USUAL_WORK, TOLERANCE)
+        design, proof = prove_bound(request, design, rng, tolerance=tolerance, most_work=work, cancel=clock.over)
     if proof is None or not proof.holds:
         design = maximised(request, design, rng, clock.over)
     return design, proof

@@ -167,6 +167,10 @@ class Timetable:
     arrivals: FloatArray
     ways_back: FloatArray
 
+    def __post_init__(self) -> None:
+        for name in ("repetitions", "travel", "aside", "arrivals", "ways_back"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
     @property
     def arrive(self) -> FloatArray:
         """(m,) seconds from the start at which the robot first stands there."""

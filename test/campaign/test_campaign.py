@@ -28,7 +28,7 @@ from calib_planner.identification import IdentificationProblem
 from calib_planner.planning import Search, plan_for_accuracy
 from calib_planner.robot.masses import LinkMass
 from calib_planner.simulation import simulated
-from calib_planner.units import length
+from calib_planner.units import lengths
 
 
 def test_eight_robots_are_as_good_as_predicted():
@@ -191,7 +191,7 @@ def test_a_reached_campaign_says_nothing_else():
         else:
             assert result.message in [r.text for r in result.verdict.reasons]
         (reason,) = (r for r in result.verdict.reasons if r.code == "required_accuracy")
-        assert length(result.accuracy) in reason.text
+        assert lengths(result.accuracy, result.required_accuracy)[0] in reason.text
         assert result.accuracy >= result.estimate.accuracy.worst
 
 

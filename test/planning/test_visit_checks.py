@@ -130,7 +130,7 @@ def test_a_sheet_keeps_the_plan_and_its_order(kuka):
     with pytest.raises(ValueError, match="read-only"):
         sheet.checks.margins[0, 0] = 0
     with pytest.raises(ValueError, match="read-only"):
-        sheet.timetable.arrive[0] = 0
+        sheet.timetable.arrivals[0] = 0
 
 
 def test_identity_is_that_of_what_is_measured(kuka):

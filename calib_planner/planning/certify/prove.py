@@ -42,6 +42,8 @@ from calib_planner.tracker import Isotropic
 
 TOLERANCE = 1e-4
 """Relative, of d; half of it for ρ0."""
+CLOSELY = 1e-6
+"""The same where a proof is required: it costs a tenth more."""
 TIME_LIMIT = 20.0
 LARGEST_GRID = 5**8
 USUAL_WORK = 2.5e7
