@@ -259,7 +259,7 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
         search,
         "--starts",
         "N",
-        "number of random starts (48; with a whole error model 4, or 1 for 20 configurations and more)",
+        "number of random starts (48; with a whole error model 2, or 1 for 20 configurations and more)",
         kind=int,
     )
     option(search, "--time-limit", "S", "time after which the search ends [s]", float("inf"))

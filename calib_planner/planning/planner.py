@@ -43,7 +43,7 @@ from calib_planner.planning.search.enumeration import best_of_all
 from calib_planner.planning.search.exchange import ChoiceProblem, check_choice, choose
 from calib_planner.planning.search.multistart import SearchProblem, SearchResult, parts, search_chunk
 from calib_planner.planning.search.rounding import heaviest_places, improved, rounded_rows
-from calib_planner.planning.search.swaps import swapped
+from calib_planner.planning.search.swaps import drawn_plan, swapped
 from calib_planner.planning.tour import visiting_order
 from calib_planner.robot import NO_LEVER
 
@@ -315,6 +315,7 @@ def _search(
             feasibility=space.feasibility,
             support=design.support if design else nobody,
             weights=design.weights if design else np.empty(0),
+            tests=space.problem.test_pose_array,
         )
 
     search = replace(
@@ -374,7 +375,7 @@ class _Rounded:
                 np.random.default_rng(space.problem.search.seed),
                 [(space.model, self.criterion, space.prior)],
             )
-            return [swapped(sizes, size, support, weights, support[:0], rng)[0]]
+            return [swapped(sizes, *drawn_plan(size, support, weights, support[:0], rng), rng)[0]]
         request = _choice(space, self.criterion, design.support, design)
         low, high = space.robot.joint_limits.T
         places = heaviest_places(design.support, design.weights, high - low)

@@ -50,7 +50,7 @@ class Search:
     """How the planner searches.
 
     Attributes:
-        starts: Random starts; ``None``: 48; with a whole error model 4, and 1 from ``LARGE`` configurations on.
+        starts: Random starts; ``None``: 48; with a whole error model 2, and 1 from ``LARGE`` configurations on.
         seed: The same seed gives the same plan.
         time_limit: Seconds after which the best plan so far is returned.
         general_weight: Share of the test-pose criterion given to the mean accuracy over all joint limits. It
@@ -75,7 +75,7 @@ class Search:
 
     def chosen(self, whole: bool, configurations: int) -> Search:
         """The same with the values that stand for ``None``; ``whole``: with a whole error model."""
-        starts, share = (4 if configurations < LARGE else 1, GENERAL_SHARE) if whole else (48, PAPERS_SHARE)
+        starts, share = (2 if configurations < LARGE else 1, GENERAL_SHARE) if whole else (48, PAPERS_SHARE)
         return replace(
             self,
             starts=starts if self.starts is None else self.starts,

@@ -8,7 +8,7 @@ rounding it, which the descent then repairs; a third repeats a good small plan, 
 Table 2 show that good plans are a few good configurations repeated; the rest is random.
 
 With a whole error model every start is a random draw from the approximate design after swaps with random
-configurations (see ``swaps``): from there one descent ends above the best of eight from elsewhere.
+configurations, and with those that have angles in common with the test poses and with each other (see ``swaps``).
 
 Feasibility. Every start is feasible, and with constraints the descents keep inside and follow the edges of the
 allowed set (see ``interior``): what comes out is feasible by construction. An edge that a constraint does not
@@ -24,7 +24,7 @@ Work is cut into independent ``parts`` with their own seeds, whatever executes t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,10 +34,10 @@ from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.feasibility import Feasibility, PlanWalls
 from calib_planner.planning.information import InformationModel, Model
 from calib_planner.planning.problem import LARGE
-from calib_planner.planning.search.apart import APART, nearest, repelling
+from calib_planner.planning.search.apart import repelling
 from calib_planner.planning.search.descent import Descent, Objective, descend, wander
 from calib_planner.planning.search.interior import descend_inside
-from calib_planner.planning.search.swaps import DRAWN, swapped
+from calib_planner.planning.search.swaps import DRAWN, drawn_plan, mixed, swapped
 
 CHUNKS, LARGEST = 4, 32
 """Fewest parts of the work, and most starts in one."""
@@ -60,6 +60,10 @@ INSIDE = Effort(16, 1e-3), Effort(60, 1e-5, (1e-4, 2e-6))
 """The same with constraints: the last pressure leaves 2e-6 of Ψ per active margin."""
 EXTENDED = Effort(100, 1e-4, (3e-3, 1e-4))
 """With a whole error model: its promise is not known to 0.01 %, and an evaluation takes ten times as long."""
+LIGHT = 1e-2
+"""Share of the heaviest weight of the approximate design below which a configuration is spread, no choice."""
+MIXES = 1
+"""Rounds of swaps with configurations mixed from those of the plan and the test poses."""
 BATCH = 4_000_000
 """Numbers in the inverse Hessians of descents side by side: beyond that, moving them through memory takes longer
 than the work on them, and a large plan would not notice for seconds that it was cancelled."""
@@ -87,6 +91,7 @@ class SearchProblem:
         weights: (K,) their weights.
         beside: The same problem for other sizes of the robot's errors, its model ``scaled``: the best plan of
             every part is improved for the mean of log Ψ over all of them.
+        tests: (K, joints) test poses, whose joints' angles are worth measuring at; K may be 0.
     """
 
     model: Model
@@ -97,6 +102,7 @@ class SearchProblem:
     support: FloatArray
     weights: FloatArray
     beside: tuple[SearchProblem, ...] = ()
+    tests: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,18 +242,31 @@ def _swapped(
     cancel: Callable[[], bool],
 ) -> tuple[FloatArray, int]:
     """(starts, size, joints) plans from the approximate design after swaps, and swaps tried."""
-    heavy, plans, tried = problem.weights > 0, [], 0
-    # A large plan differs less from one size of the errors to the next, and each size costs as much as the first.
-    every = (problem, *problem.beside) if problem.size < LARGE else (problem,)
-    sizes = [(p.model, p.criterion, p.prior) for p in every if isinstance(p.model, ExtendedModel)]
+    draw, size, tests = problem.feasibility.sample, problem.size, problem.tests
+    heavy, plans, tried = problem.weights > LIGHT * problem.weights.max(initial=0.0), [], 0
     support, weights = problem.support[heavy], problem.weights[heavy]
+    # A large plan differs less from one size of the errors to the next, and each size costs as much as the first.
+    every = (problem, *problem.beside) if size < LARGE else (problem,)
+    sizes = [(p.model, p.criterion, p.prior) for p in every if isinstance(p.model, ExtendedModel)]
+    count = DRAWN // (3 * len(model.robot.targets))
     for _ in range(starts):
-        drawn = problem.feasibility.sample(rng, max(DRAWN // (3 * len(model.robot.targets)), problem.size))
-        plan, more = swapped(sizes, problem.size, support, weights, drawn, rng, cancel)
-        crowded = nearest(model.robot, plan) < APART
-        plans.append(shake(problem, plan[None], rng)[0] if crowded else plan)
+        drawn = draw(rng, max(count, size))
+        if len(tests):
+            of_tests = tests[rng.integers(len(tests), size=len(drawn))]
+            known = mixed(of_tests, drawn, rng)
+            use = problem.feasibility.mask(known) & (np.arange(len(drawn)) % 2 == 1)
+            drawn[use] = known[use]
+        plan, others = drawn_plan(size, support, weights, drawn, rng)
+        plan, more = swapped(sizes, plan, others, rng, cancel)
         tried += more
-    return np.stack(plans), tried
+        for _ in range(MIXES):
+            stock = np.concatenate([plan, tests]) if len(tests) else plan
+            first, second = rng.integers(len(stock), size=(2, count))
+            known = mixed(stock[first], stock[second], rng)
+            plan, more = swapped(sizes, plan, known[problem.feasibility.mask(known)], rng, cancel)
+            tried += more
+        plans.append(plan)
+    return shake(problem, np.stack(plans), rng), tried
 
 
 def shake(problem: SearchProblem, plans: FloatArray, rng: np.random.Generator) -> FloatArray:

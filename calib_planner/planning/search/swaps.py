@@ -12,6 +12,12 @@ so that by Woodbury's identity an accuracy, Ψ = 1/tr(A M⁻¹), is
 
 One step is some products of matrices for all candidates together, without a factorisation for each. Other
 criteria try the candidates that are best to first order. X and V of all candidates are computed once.
+
+*Equal angles.* A joint's error repeats where its angle does, so that it is worth much to a plan to measure at the
+angles of a test pose, or twice at one angle while the other joints move. Random configurations have none in
+common, and a descent finds them slowly, one after the other. So candidates are ``mixed`` too: some joints stand
+as in one configuration, the others as in another. First the test poses are mixed with random configurations, then
+those of the plan with each other.
 """
 
 from __future__ import annotations
@@ -25,13 +31,15 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.planning.criteria import Accuracy, Criterion, log_values, ridged
 from calib_planner.planning.extended import ExtendedModel, LinearisedExtension
 
-DRAWN = 600
-"""Equations of the random candidates: 200 configurations with one target. 500 gain 0.01 of log Ψ, in twice the
-time; after a descent hardly anything of it is left."""
+DRAWN = 450
+"""Equations of the other candidates: 150 configurations with one target. 200 gain nothing after a descent."""
 SWEEPS = 3
 """Most rounds through the configurations of the plan; the third changes a tenth of what the first does."""
 TRIED = 8
 """Candidates that a criterion other than an accuracy tries: the best to first order."""
+SHARES = 0.3, 0.5, 0.8
+"""Of ``mixed``: how many of the joints stand as in the first configuration; the test pose with one joint turned
+is as useful as a configuration that has one angle in common with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,36 +134,56 @@ def improved(
     return plan, tried
 
 
+def mixed(first: FloatArray, second: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(N, joints) each joint as in that row of ``first`` or of ``second``, both (N, joints) [rad | m]."""
+    share = rng.choice(SHARES, (len(first), 1))
+    return np.where(rng.random(first.shape) < share, first, second)
+
+
 def swapped(
     sizes: Sequence[tuple[ExtendedModel, Criterion, FloatArray]],
-    count: int,
-    support: FloatArray,
-    weights: FloatArray,
-    drawn: FloatArray,
+    plan: FloatArray,
+    others: FloatArray,
     rng: np.random.Generator,
     cancel: Callable[[], bool] = lambda: False,
 ) -> tuple[FloatArray, int]:
-    """A plan drawn from an approximate design after swaps.
+    """A plan after swaps with other configurations.
 
     Args:
         sizes: Model, criterion and M₀ (p, p) for every size of the robot's errors; the models are the first,
             ``scaled``.
-        count: m, configurations of the plan.
-        support: (K, joints) configurations of the design, each once [rad | m].
-        weights: (K,) their weights, positive.
-        drawn: (D, joints) further candidates; K + D ≥ m.
-        rng: Of the first plan, and of the order of the swaps.
+        plan: (m, joints) the plan to begin with [rad | m].
+        others: (D, joints) what may take the place of its configurations [rad | m].
+        rng: Of the order of the swaps.
         cancel: ``True`` ends the work with what there is.
 
     Returns:
         (m, joints) the plan [rad | m], and the number of swaps tried.
     """
-    candidates = np.concatenate([support, drawn])
-    begin: IntArray = np.arange(count)  # where the design has too few, the first of the others complete it
-    if len(support) >= count:
-        begin = rng.choice(len(support), count, replace=False, p=weights / weights.sum())
-    first = sizes[0][0]
+    candidates, first = np.concatenate([plan, others]), sizes[0][0]
     info = first.linearised(candidates)
     every = [Swaps.among(info, criterion, prior, m.factor / first.factor) for m, criterion, prior in sizes]
-    chosen, tried = improved(every, begin, rng, cancel)
+    chosen, tried = improved(every, np.arange(len(plan)), rng, cancel)
     return candidates[chosen], tried
+
+
+def drawn_plan(
+    count: int, support: FloatArray, weights: FloatArray, others: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """``count`` of the configurations of an approximate design, and the rest of all.
+
+    Args:
+        count: m.
+        support: (K, joints) configurations of the design, each once [rad | m].
+        weights: (K,) their weights, positive.
+        others: (D, joints) further ones, K + D ≥ m; where the design has too few, the first of them complete it.
+        rng: Of the draw.
+
+    Returns:
+        (m, joints) and (K + D − m, joints) [rad | m].
+    """
+    every = np.concatenate([support, others])
+    begin: IntArray = np.arange(count)
+    if len(support) >= count:
+        begin = rng.choice(len(support), count, replace=False, p=weights / weights.sum())
+    return every[begin], np.delete(every, begin, axis=0)
