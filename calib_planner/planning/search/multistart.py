@@ -91,7 +91,7 @@ class SearchProblem:
         weights: (K,) their weights.
         beside: The same problem for other sizes of the robot's errors, its model ``scaled``: the best plan of
             every part is improved for the mean of log Ψ over all of them.
-        tests: (K, joints) test poses, whose joints' angles are worth measuring at; K may be 0.
+        tests: (K, joints) test poses, at whose joints' angles starts measure too; K may be 0.
     """
 
     model: Model

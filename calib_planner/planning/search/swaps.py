@@ -13,7 +13,7 @@ so that by Woodbury's identity an accuracy, Ψ = 1/tr(A M⁻¹), is
 One step is some products of matrices for all candidates together, without a factorisation for each. Other
 criteria try the candidates that are best to first order. X and V of all candidates are computed once.
 
-*Equal angles.* A joint's error repeats where its angle does, so that it is worth much to a plan to measure at the
+*Equal angles.* A joint's error repeats where its angle does, so that a plan gains much by measuring at the
 angles of a test pose, or twice at one angle while the other joints move. Random configurations have none in
 common, and a descent finds them slowly, one after the other. So candidates are ``mixed`` too: some joints stand
 as in one configuration, the others as in another. First the test poses are mixed with random configurations, then
