@@ -62,7 +62,7 @@ class DemoSettings:
         configurations: Different configurations of the plan.
         repetitions: Measurements at each.
         sigma: Standard deviation of one tracker coordinate [m].
-        starts: Random starts of the search.
+        starts: Random starts of the search; ``None``: as many as usual.
         random_plans: Random plans to compare with.
         seed: Of the true errors, the noise, the search and the random plans.
     """
@@ -70,7 +70,7 @@ class DemoSettings:
     configurations: int = 30
     repetitions: int = 1
     sigma: float = 3e-5
-    starts: int = 64
+    starts: int | None = None
     random_plans: int = RANDOM_PLANS
     seed: int = SEED
 

@@ -129,7 +129,7 @@ def plan_problem(state: CampaignState, known: Assessment | None) -> PlanProblem:
         constraints=state.constraints,
         measured=None if known is None else known.used,
         search=Search(
-            starts=problem.starts, seed=problem.seed + len(state.rounds), time_limit=problem.time_limit
+            starts=problem.starts or None, seed=problem.seed + len(state.rounds), time_limit=problem.time_limit
         ),
     )
 

@@ -65,7 +65,7 @@ class CampaignProblem:
             joint's range.
         accuracy_frame: Of what is not known at the test poses, (M3): ``world`` or ``robot``.
         identification: Further settings of ``IdentificationProblem``, see ``OPTIONS``.
-        starts, time_limit: Of each plan's search, see ``PlanProblem``.
+        starts, time_limit: Of each plan's search, see ``Search``; no starts: as many as usual.
         seed: Same seed and same measurements, same campaign.
     """
 
@@ -84,7 +84,7 @@ class CampaignProblem:
     exclusion: float = 0.05
     accuracy_frame: str = "world"
     identification: Mapping[str, Any] = field(default_factory=dict)
-    starts: int = 16
+    starts: int = 0
     time_limit: float = 60.0
     seed: int = 0
 
@@ -109,7 +109,7 @@ class CampaignProblem:
             noise=self.instrument,
             accuracy_frame=self.accuracy_frame,
             constraints=self.constraints,
-            search=Search(starts=self.starts, seed=self.seed, time_limit=self.time_limit),
+            search=Search(starts=self.starts or None, seed=self.seed, time_limit=self.time_limit),
         )
         put(self, "test_poses", checked.test_pose_array)
         put(self, "constraints", checked.constraints)

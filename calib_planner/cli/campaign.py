@@ -117,7 +117,9 @@ def add(commands: Commands, summary: str) -> None:
     text = "rms error of its joints' transmissions, on top [rad]"
     option(play, "--simulate-transmission", "S", text, 0.0)
     option(parser, "--output", "DIR", "folder for measurements, validation and estimate")
-    option(parser, "--starts", "N", "number of random starts of each search", DEFAULTS["starts"])
+    option(
+        parser, "--starts", "N", "number of random starts of each search; 0: as many as usual", DEFAULTS["starts"]
+    )
     add_seed(parser)
 
 

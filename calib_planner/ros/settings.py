@@ -219,7 +219,7 @@ class CampaignParameters(PlanParameters):
     sigma: float = parameter(1e-5, "expected noise of one coordinate of one measurement", "m", 1e-9, 1.0)
     error_model: str = parameter("typical", ERROR_MODEL)
     accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
-    starts: int = parameter(16, "random starts of the search of a plan", "", 1, 100000)
+    starts: int = parameter(0, "random starts of the search; 0: as many as usual", "", 0, 100000)
     seed: int = parameter(0, "seed of the plans", "", 0, LARGEST_SEED)
     store_folder: str = parameter(
         "",
