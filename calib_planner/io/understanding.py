@@ -240,7 +240,7 @@ def measurements_in(table: Table, meaning: Meaning, robot: Robot, reading: Readi
     factors, unit, length_from, more = length_factors(table, meaning, "point", points, robot, reading)
     if std is not None:
         check_std(table, points, std)
-        std = std * length_factors(table, meaning, "std", points, robot, reading)[0]
+        std = std / (1.0 / length_factors(table, meaning, "std", points, robot, reading)[0])
     understanding = Understanding(
         **facts_of(table),
         columns=meaning_names(meaning, robot.joint_names),
@@ -250,7 +250,8 @@ def measurements_in(table: Table, meaning: Meaning, robot: Robot, reading: Readi
         length_from=length_from,
         remarks=(*remarks, *more),
     )
-    data = Measurements(robot.joint_names, q, points * factors, std, payload_in(table, meaning))
+    metres = points / (1.0 / factors)  # 159.763 mm are 0.159763 m: a product with 1e-3 has other last digits
+    data = Measurements(robot.joint_names, q, metres, std, payload_in(table, meaning))
     return Source(table.path, data, table.lines, table.word, understanding, meaning.ignored)
 
 
