@@ -52,7 +52,7 @@ from calib_planner.robot import Layout, Robot
 from calib_planner.tracker import Isotropic, Noise, covariance_gradient
 
 try:
-    import calib_planner.planning._kernel as _kernel  # type: ignore[import-not-found]
+    import calib_planner.planning._kernel as _kernel
 except ImportError:  # not built: NumPy does the same, more slowly
     _kernel = None
 

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from calib_planner.robot.elements import Element
 
 try:
-    import calib_planner.robot._kernel as _kernel  # type: ignore[import-not-found]
+    import calib_planner.robot._kernel as _kernel
 except ImportError:  # not built: NumPy does the same, more slowly
     _kernel = None
 
