@@ -74,10 +74,12 @@ def said(line: str, printed: str) -> bool:
     return any(re.search(pattern, " ".join(row.split())) for row in printed.splitlines())
 
 
-def run(page: Path, folder: Path, timeout: float = 240.0, programs: Path | None = None) -> Run:
+def run(
+    page: Path, folder: Path, timeout: float = 240.0, programs: Path | None = None, shell: str = "bash"
+) -> Run:
     """Run the examples of ``page`` in ``folder``; ends at the first that fails.
 
-    ``programs``: a folder that comes first in PATH.
+    ``programs``: a folder that comes first in PATH. ``shell``: ``bash`` or ``zsh``.
     """
     for name in COPIED:
         shutil.copytree(ROOT / name, folder / name)
@@ -94,7 +96,7 @@ def run(page: Path, folder: Path, timeout: float = 240.0, programs: Path | None 
         else:
             lines.append(example.text)
     done = subprocess.run(
-        ["bash", "-c", "\n".join(lines)],
+        [shell, "-c", "\n".join(lines)],
         cwd=folder,
         env=environment(programs),
         stdin=subprocess.DEVNULL,

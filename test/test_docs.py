@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from docs_examples import ROOT, blocks, environment, examples, expectations, run, said
+from robots import repeats
 from warm_commands import warm_commands
 
 from calib_planner.cli import main
@@ -54,12 +56,17 @@ def programs() -> Iterator[Path]:
         yield made
 
 
+@pytest.mark.parametrize("shell", repeats(("bash",), ("bash", "zsh")))
 @pytest.mark.parametrize("page", [p for p in PAGES if examples(p)], ids=named)
-def test_examples_run_and_print_what_the_page_says(page: Path, tmp_path: Path, programs: Path) -> None:
+def test_examples_run_and_print_what_the_page_says(
+    page: Path, shell: str, tmp_path: Path, programs: Path
+) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell} here")
     if page.name == "scaling.md":
         pytest.importorskip("distributed")
     PREPARED.get(named(page), lambda _: None)(tmp_path)
-    done = run(page, tmp_path, programs=programs)
+    done = run(page, tmp_path, programs=programs, shell=shell)
     shown = examples(page)
     assert done.status == 0, f"{page.name}, line {shown[len(done.printed) - 1].line}:\n{done.errors}"
     for number, line in expectations(page):
