@@ -55,6 +55,8 @@ from calib_planner.planning.search.interior import descend_inside
 SPREAD = 256
 DRAWN_FIRST = 400
 """Random configurations that share the first measure: a good one has some of them near its own."""
+GAP = 3e-3
+"""Relative, of Ψ: how near the bound of a design its value is; half of it for ρ0."""
 FIRST_FLOOR, LAST_FLOOR = 1e-2, 1e-4
 """Weight of a spread of random configurations in every measure, first and last. The optimum is often singular:
 the spread makes M invertible and d smooth, and costs the bound about its weight times the price of a random
@@ -117,7 +119,7 @@ def approximate_design(
     executor: Executor | None = None,
     *,
     rounds: int = 60,
-    gap: float = 3e-3,
+    gap: float = GAP,
 ) -> ApproximateDesign:
     """Grow a discrete measure until the bound is within ``gap`` of its value.
 
@@ -189,7 +191,7 @@ def _grown(
     cancel: Callable[[], bool],
     *,
     rounds: int = 60,
-    gap: float = 3e-3,
+    gap: float = GAP,
     floor: float = FIRST_FLOOR,
 ) -> ApproximateDesign:
     model, visits, best = problem.model, problem.visits, None

@@ -21,6 +21,7 @@ from calib_planner.arrays import FloatArray, one_thread
 from calib_planner.error_model import FELT, Poses, covariance, error_variance
 from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning.bound import (
+    GAP,
     ApproximateDesign,
     DesignProblem,
     approximate_design,
@@ -108,7 +109,8 @@ def plan(
     *seeds, own = np.random.SeedSequence(problem.search.seed).spawn(len(parts(problem.starts)) + 1)
     criterion, target = _criteria(space, np.random.default_rng(own))
     rng = np.random.default_rng(own)
-    design = _approximate(space, target, rng, clock.over, executor) if target.concave else None
+    gap = CLOSELY if prove else GAP  # a required proof is worth a design that is near its own bound
+    design = _approximate(space, target, rng, clock.over, executor, gap) if target.concave else None
     proof = None
     if design is not None:
         design, proof = _proven(space, target, design, np.random.default_rng(own.spawn(1)[0]), clock, prove)
@@ -243,10 +245,11 @@ def _approximate(
     rng: np.random.Generator,
     cancel: Callable[[], bool],
     executor: Executor | None = None,
+    gap: float = GAP,
 ) -> ApproximateDesign:
     tests = space.problem.test_pose_array
     usable = tests[space.feasibility.mask(tests)] if space.problem.candidates is None else tests[:0]
-    return approximate_design(_design_problem(space, criterion), usable, rng, cancel, executor)
+    return approximate_design(_design_problem(space, criterion), usable, rng, cancel, executor, gap=gap)
 
 
 def _design_problem(space: PlanSpace, criterion: Criterion) -> DesignProblem:

@@ -12,6 +12,7 @@ from calib_planner_msgs.msg import CalibrationEstimate
 from calib_planner_msgs.msg import Plan as PlanMessage
 from desk import NAME, Desk, S
 from fake_cell import FakeCell
+from robots import repeats
 
 from calib_planner.campaign import FIT, finish
 from calib_planner.ros import campaign as campaign_measuring
@@ -152,7 +153,7 @@ def test_the_identifier_ends_with_all_of_the_fit(bench: Bench, contradicts: list
     assert not contradicts
 
 
-@pytest.mark.parametrize("joins", [False, True])
+@pytest.mark.parametrize("joins", repeats([True], [False, True]))
 def test_so_it_does_after_a_restart_in_the_validation(
     bench: Bench, contradicts: list[bool], tmp_path: Path, joins: bool
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 from bench import Bench
 from desk import ASKED, Desk, S
 from fake_cell import FakeCell
+from robots import repeats
 
 from calib_planner import Robot
 from calib_planner.io import open_campaign
@@ -56,7 +57,9 @@ def runs(bench: Bench, tmp_path: Path) -> Iterator[Restarts]:
         made.nodes.end(signal.SIGKILL)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+@pytest.mark.parametrize(
+    "number", repeats([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]), ids=lambda n: n.name
+)
 def test_told_to_end_the_robot_stops_and_a_restart_goes_on(
     bench: Bench, runs: Restarts, number: signal.Signals
 ) -> None:

@@ -84,6 +84,7 @@ def test_a_campaign_with_a_robot_that_errs_in_every_way(bench: Bench) -> None:
     assert np.isfinite(done.round_accuracy[-1]) and done.validation_rms < 4 * done.validation_predicted
     bench.wait(lambda: estimates)
     found = estimates[-1]
-    assert {"placement", "gravity", "smooth"} <= set(found.terms) and found.header.frame_id == "base_link"
+    assert {"placement", "gravity"} <= set(found.terms) and {"smooth", "short"} & set(found.terms)
+    assert found.header.frame_id == "base_link"
     assert 4 <= found.configurations <= done.measured and found.left_out_rms < 4 * found.left_out_predicted_rms
     assert all(p.header.frame_id == "base_link" for p in plans)
