@@ -17,10 +17,10 @@ from calib_planner.units import length
 
 NOISE = {"known": {"sigma": SIGMA}, "unknown": {}}
 CELLS = {
-    "kuka": (plain_cell, 40, repeats(2, 12)),
-    "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, repeats(3, 12)),
+    "kuka": (plain_cell, 40, repeats(3, 12)),
+    "planar": (lambda seed: plain_cell(seed, "planar_2r"), 40, repeats(4, 12)),
     "full base tool": (placed_cell, 50, repeats(1, 4)),
-    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, repeats(1, 8)),
+    "full base tool, one target": (lambda seed: placed_cell(seed, targets=TARGETS[:1]), 80, repeats(2, 8)),
 }
 
 
