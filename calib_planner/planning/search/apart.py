@@ -1,8 +1,8 @@
 """Visits of one plan keep apart: no two of them where one would repeat the errors of the other.
 
 A robot comes back to a configuration with nearly the same error: the joints' functions and gravity are those of
-before, and only the repeatability is new. A second visit there is a *repetition*; it costs a minute less than a
-visit elsewhere, and the plan has its own word for it. So the m configurations of a plan that expects a real robot
+before, and only the repeatability is new. A second visit there is a *repetition*; it takes less time than a visit
+elsewhere, and a plan counts it apart. So the m configurations of a plan that expects a real robot
 are to be different. The distance of q and q' is the chord
 
     d² = Σ_j 2 (1 − cos(q_j − q'_j))        (sliding joints: π times the share of the range)
@@ -28,7 +28,10 @@ APART = 0.1
 """Least distance of two visits: joint functions of real robots vary within 0.06 to 0.07 rad, so that a joint that
 has moved so far shows little of the error that it had (see docs/planning-real-robots.md)."""
 MARGIN = 1.15
+"""δ over APART: what a pair that is pulled together may give way."""
 STIFFNESS = 5.0
+"""At APART the cost falls by 2·STIFFNESS·(1 − 1/MARGIN)/δ = 11 per radian: twice what some tenths of log Ψ
+pull that are gained within APART."""
 
 
 def nearest(robot: Robot, q: FloatArray) -> FloatArray:
