@@ -83,7 +83,7 @@ class Heard:
     def measurement(self, message: Measurement) -> None:
         now = time.time_ns()
         if message.status == Measurement.ACCEPTED:
-            self.decided[nanoseconds(message.header.stamp) + round(message.duration * NANO / 2)] = now
+            self.decided[nanoseconds(message.header.stamp) + nanoseconds(message.duration) // 2] = now
         else:
             self.rejected.append(f"{message.status}: {message.reason}")
 

@@ -2,7 +2,7 @@
 
     ros2 launch calib_planner demo.launch.py robot:=kuka_kr270 seed:=1 save_folder:=$HOME/calibration rviz:=true
     ros2 service call /calibration_planner/request_plan calib_planner_msgs/srv/PlanCalibration \
-        "{test_poses: [0, -1.047, 1.571, 0, 0.785, 0], configurations: 12}"
+        "{request: {test_poses: [{positions: [0, -1.047, 1.571, 0, 0.785, 0]}], configurations: 12}}"
     ros2 topic echo --once /calibration_planner/current_plan        # the plan, for the action's goal
     ros2 action send_goal /tracker_simulator/execute_plan calib_planner_msgs/action/ExecutePlan "{plan: …}"
     ros2 topic echo /calibration_identifier/estimate                # after every accepted configuration

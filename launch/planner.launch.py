@@ -10,7 +10,7 @@ to hold only what differs from config/planner.yaml, where all parameters are wit
 Arguments that are given win over files; those that are not leave what the files say. Then:
 
     ros2 service call /calibration_planner/request_plan calib_planner_msgs/srv/PlanCalibration \
-        "{test_poses: [0, -1.047, 1.571, 0, 0.785, 0], configurations: 12}"
+        "{request: {test_poses: [{positions: [0, -1.047, 1.571, 0, 0.785, 0]}], configurations: 12}}"
 """
 
 from launch import LaunchDescription

@@ -12,7 +12,7 @@ from calib_planner.io.robots import URDF_SUFFIXES, Robot, config_folder, shipped
 
 if TYPE_CHECKING:
     from calib_planner.io.bag import read_bag
-    from calib_planner.io.cell import CELL_KEYS, EITHER, Cell, read_cell, write_cell
+    from calib_planner.io.cell import CELL_KEYS, EITHER, NAMED_MODELS, Cell, read_cell, write_cell
     from calib_planner.io.conditions import planned_error_model, read_constraints, read_instrument, read_vertical
     from calib_planner.io.csv import format_table, measurements_text, write_configurations, write_measurements
     from calib_planner.io.data import (
@@ -98,7 +98,7 @@ else:
         __name__,
         {
             "bag": "read_bag",
-            "cell": "CELL_KEYS EITHER Cell read_cell write_cell",
+            "cell": "CELL_KEYS EITHER NAMED_MODELS Cell read_cell write_cell",
             "conditions": "planned_error_model read_constraints read_instrument read_vertical",
             "csv": "format_table measurements_text write_configurations write_measurements",
             "data": "in_units is_bag read_configurations read_data read_joints read_plan_csv with_units",

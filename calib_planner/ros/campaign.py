@@ -37,7 +37,14 @@ from calib_planner.measurements import configuration_labels
 from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
-from calib_planner.ros.messages import NAN, estimate_to_message, in_ros, plan_to_message, reasons_of
+from calib_planner.ros.messages import (
+    NAN,
+    duration_message,
+    estimate_to_message,
+    in_ros,
+    plan_to_message,
+    verdict_message,
+)
 from calib_planner.ros.model import Model, NotReady, with_targets
 from calib_planner.ros.planning import constraints_of
 from calib_planner.ros.session import confined
@@ -320,7 +327,7 @@ class Measuring:
         elif not self.waiting or self._due():
             part = plan.part(plan.numbers.index(visit.action.index))
             goal = plan_to_message(part, plan.plan_id, self._node.now, settings.frame_id)
-            self._execution.send(ExecutePlan.Goal(plan=goal, dwell=settings.dwell))
+            self._execution.send(ExecutePlan.Goal(plan=goal, dwell=duration_message(settings.dwell)))
             visit.next("moving")
 
     def _moved(self, state: CampaignState, visit: Visit, ended: Ended) -> CampaignState:
@@ -378,7 +385,7 @@ def _joints(message: Measurement, state: CampaignState) -> FloatArray:
     names = state.problem.robot.joint_names
     if sorted(message.joint_names) != sorted(names):
         raise InputError("measurement.joint_names", listed(message.joint_names), ", ".join(names))
-    return pick_joints(message.joint_names, message.joint_positions, names)
+    return pick_joints(message.joint_names, message.configuration.positions, names)
 
 
 FIELD = "store_folder"
@@ -394,8 +401,7 @@ def result_message(result: CampaignResult, campaign_id: str, frame_id: str) -> C
         plan_id=campaign_id,
         configurations=len(np.unique(configuration_labels(result.fit.q))),
         complete=result.outcome == "reached",
-        verdict=result.verdict.level,
-        reasons=reasons_of(result.verdict),
+        verdict=verdict_message(result.verdict),
     )
 
 
@@ -422,10 +428,14 @@ OUTCOME = {
 }
 
 
+NUMBERS = ("predicted_accuracy", "required_accuracy", "sigma", "left_out_rms", "validation_rms",
+           "validation_predicted_rms")  # fmt: skip
+"""Numbers of a status that are not known before there is a campaign."""
+
+
 def idle_status(reason: str) -> CampaignStatus:
     """The status before the first campaign."""
-    unknown = ("predicted_accuracy", "required_accuracy", "sigma", "validation_rms", "validation_predicted")
-    return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **dict.fromkeys(unknown, NAN))
+    return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **dict.fromkeys(NUMBERS, NAN))
 
 
 def status_message(state: CampaignState, campaign_id: str, waiting: str, reason: str) -> CampaignStatus:
@@ -456,14 +466,16 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
         required_accuracy=problem.required_accuracy,
         sigma=NAN if last is None else last.sigma,
         validation_rms=NAN,
-        validation_predicted=NAN,
+        validation_predicted_rms=NAN,
+        left_out_rms=NAN,
         round_measured=[r.measured for r in state.rounds],
         round_accuracy=[r.accuracy if math.isfinite(r.accuracy) else NAN for r in state.rounds],
         joint_names=list(problem.robot.joint_names),
         reason=cut(in_ros("; ".join(filter(None, (waiting, reason, state.message))))),
     )
     if isinstance(action, Measure):
-        message.configuration_index, message.configuration = action.index, action.q.tolist()
+        message.configuration_index = action.index
+        message.configuration.positions = action.q.tolist()
     if isinstance(action, Finished):
         _fill_result(message, action.result)
     return message
@@ -484,7 +496,7 @@ def _state(state: CampaignState, waiting: str) -> int:
 
 def _fill_result(message: CampaignStatus, result: CampaignResult) -> None:
     message.predicted_accuracy = NAN if math.isinf(result.accuracy) else result.accuracy
-    message.verdict, message.reasons = result.verdict.level, reasons_of(result.verdict)
+    message.verdict = verdict_message(result.verdict)
     validation = None if result.estimate is None else result.estimate.validation
     if validation is not None:
-        message.validation_rms, message.validation_predicted = validation.rms, validation.predicted_rms
+        message.validation_rms, message.validation_predicted_rms = validation.rms, validation.predicted_rms

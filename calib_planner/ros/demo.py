@@ -22,7 +22,7 @@ from typing import Any
 
 import rclpy
 from calib_planner_msgs.action import ExecutePlan
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, JointConfiguration, Measurement, PlanRequest
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration
 from rclpy.action import ActionClient
@@ -52,7 +52,7 @@ from calib_planner.io import fresh_folder, read_data, read_estimate
 from calib_planner.planning import PlanProblem
 from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
-from calib_planner.ros.messages import plan_from_message
+from calib_planner.ros.messages import duration_message, plan_from_message, seconds_of
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.units import length
@@ -188,7 +188,6 @@ class DemoClient:
         return finished.result().result if finished.done() else None
 
     def _missing(self, plan: PlanMessage) -> PlanMessage:
-        n = len(plan.joint_names)
         left = [max(r - c, 0) for r, c in zip(plan.repetitions, self.measured(plan), strict=True)]
         rows = [i for i, count in enumerate(left) if count] or list(range(len(left)))
         return PlanMessage(
@@ -196,7 +195,7 @@ class DemoClient:
             robot=plan.robot,
             parameters=plan.parameters,
             joint_names=plan.joint_names,
-            configurations=[x for i in rows for x in plan.configurations[i * n : (i + 1) * n]],
+            configurations=[plan.configurations[i] for i in rows],
             repetitions=[max(left[i], 1) for i in rows],
             sigma=plan.sigma,
         )
@@ -298,21 +297,21 @@ def report(folder: Path, robot: Robot, seed: int) -> None:
 def _measure(configurations: int, seed: int, client: DemoClient, screen: Screen) -> PlanMessage:
     """Have a plan made and measured; the client holds the estimate afterwards."""
     screen.say("waiting for the planner")
-    request = PlanCalibration.Request(
+    request = PlanRequest(
         robot=ROBOT,
         parameters=[LEVEL],
-        test_poses=list(TEST_POSE),
+        test_poses=[JointConfiguration(positions=list(TEST_POSE))],
         configurations=configurations,
         sigma=SIGMA / math.sqrt(SAMPLES),
         seed=seed,
-        time_limit=PLANNING,
+        time_limit=duration_message(PLANNING),
     )
     screen.say(f"planning {configurations} configurations")
-    plan = client.request_plan(request)
+    plan = client.request_plan(PlanCalibration.Request(request=request))
     best = 1e3 * plan.predicted_accuracy
     screen.console.print(
         f"planned: ρ0 = {best:.4f} mm at the test pose, at least {100 * plan.efficiency:.0f} % of what any "
-        f"plan could reach ({plan.seconds:.1f} s)"
+        f"plan could reach ({seconds_of(plan.search_time):.1f} s)"
     )
     client.wait(lambda: client.identifier_has(plan.plan_id), 30.0, "estimate from the identifier")
 

@@ -13,20 +13,22 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, ErrorTerm, JointConfiguration, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
+from calib_planner_msgs.msg import Reason as ReasonMessage
+from calib_planner_msgs.msg import Verdict as VerdictMessage
 from geometry_msgs.msg import Point, PointStamped, Vector3
-from numpy.typing import ArrayLike
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_planner.acquisition import NANO, Rejection, Standstill
 from calib_planner.arrays import FloatArray, check_array, check_number
+from calib_planner.campaign import FIT, VALIDATION
 from calib_planner.errors import InputError
 from calib_planner.identification import Verdict
 from calib_planner.io import ACCEPTED, DECISIONS
 from calib_planner.planning import STATUS as PLAN_WORDS
-from calib_planner.planning import Pace, Plan, PlanQuality, timetable
+from calib_planner.planning import Pace, Plan, PlannedTerm, PlanQuality, timetable
 from calib_planner.robot import Robot
 from calib_planner.units import brief
 
@@ -63,10 +65,12 @@ IN_ROS: tuple[tuple[str, str], ...] = (
 """Pattern of an advice for the command line → what a user of the nodes does."""
 
 ESTIMATE_NUMBERS = ("condition", "sigma_estimate", "residual_rms_before", "residual_rms_after", "left_out_rms",
-                    "left_out_predicted_rms")  # fmt: skip
+                    "left_out_max", "left_out_predicted_rms")  # fmt: skip
 """Numbers of an estimate that are not known while there is none."""
-PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency", "seconds")
+PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency")
 """Fields of ``PlanQuality`` and of the message that are the same number."""
+PURPOSE = {FIT: PlanMessage.FIT, VALIDATION: PlanMessage.VALIDATION}
+LEVELS = {"PASS": VerdictMessage.PASS, "WARN": VerdictMessage.WARN, "FAIL": VerdictMessage.FAIL}
 MEASUREMENT_STATUS = {
     word: getattr(Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}")
     for word in DECISIONS
@@ -80,9 +84,25 @@ def in_ros(text: str) -> str:
     return text
 
 
-def nanoseconds(stamp: Time) -> int:
-    """A stamp [ns]."""
+def nanoseconds(stamp: Time | Duration) -> int:
+    """A stamp or a duration [ns]."""
     return int(stamp.sec) * NANO + int(stamp.nanosec)
+
+
+def seconds_of(duration: Duration) -> float:
+    """A duration [s]."""
+    return nanoseconds(duration) / NANO
+
+
+def duration_message(seconds: float) -> Duration:
+    """A duration [s] as message, at most what one can hold."""
+    whole = round(min(seconds, 2.0**31 - 1) * NANO)
+    return Duration(sec=whole // NANO, nanosec=whole % NANO)
+
+
+def rows_message(q: FloatArray) -> list[JointConfiguration]:
+    """Configurations (rows, joints) [rad | m] as messages."""
+    return [JointConfiguration(positions=row) for row in q.tolist()]
 
 
 def stamp_message(stamp: int) -> Time:
@@ -98,38 +118,53 @@ class ReceivedPlan:
     Attributes:
         plan_id: Its name.
         plan: The plan; what no message carries (weights, predicted standard deviations, counts) is NaN or 0.
+        campaign_id: Name of the campaign that it is part of; empty for none.
+        purpose: What its measurements are for: ``fit`` or ``validation``.
     """
 
     plan_id: str
     plan: Plan
+    campaign_id: str = ""
+    purpose: str = FIT
 
 
-def plan_to_message(plan: Plan, plan_id: str, stamp: int, frame_id: str) -> PlanMessage:
-    """A plan as message, made at ``stamp`` [ns]."""
+def plan_to_message(
+    plan: Plan, plan_id: str, stamp: int, frame_id: str, campaign_id: str = "", purpose: str = FIT
+) -> PlanMessage:
+    """A plan as message, made at ``stamp`` [ns]; ``purpose`` is a key of ``PURPOSE``."""
     quality = plan.quality
     message = PlanMessage(
         plan_id=plan_id,
+        campaign_id=campaign_id,
+        purpose=PURPOSE[purpose],
         robot=plan.robot,
         parameters=list(plan.parameters),
         joint_names=list(plan.joint_names),
-        configurations=plan.configurations.ravel().tolist(),
+        configurations=rows_message(plan.configurations),
         repetitions=plan.repetitions.tolist(),
-        test_poses=plan.test_poses.ravel().tolist(),
+        test_poses=rows_message(plan.test_poses),
+        terms=[term_message(t, True) for t in quality.terms],
         sigma=float(plan.sigma),
         predicted_accuracy_per_test_pose=quality.predicted_accuracy_per_test_pose.tolist(),
         seed=int(quality.seed) % 2**32,
         status=PLAN_STATUS[quality.status],
         message=in_ros(quality.message),
-        **{name: getattr(quality, name) for name in ("criterion", "bound")},
+        search_time=duration_message(quality.seconds),
+        **{name: getattr(quality, name) for name in ("criterion", "bound", "accuracy_frame", "error_model")},
         **{name: float(getattr(quality, name)) for name in PLAN_NUMBERS},
     )
     message.header.stamp, message.header.frame_id = stamp_message(stamp), frame_id
     return message
 
 
+def term_message(term: Any, used: bool) -> ErrorTerm:
+    """A term of the error model, planned (``PlannedTerm``) or identified (``TermGain``)."""
+    return ErrorTerm(name=term.name, size=float(term.size), std=float(term.std), gain=float(term.gain), used=used)
+
+
 def no_plan() -> PlanMessage:
     """The plan of an answer that has none."""
-    return PlanMessage(status=PLAN_STATUS["empty"], **dict.fromkeys(PLAN_NUMBERS[:3], NAN))
+    return PlanMessage(status=PLAN_STATUS["empty"], **dict.fromkeys(PLAN_NUMBERS, NAN))
 
 
 def plan_from_message(message: PlanMessage) -> ReceivedPlan:
@@ -172,28 +207,38 @@ def plan_from_message(message: PlanMessage) -> ReceivedPlan:
             value=float(message.predicted_accuracy),
             value_bound=float(message.lower_bound),
             bound=message.bound,
+            accuracy_frame=message.accuracy_frame,
+            error_model=message.error_model,
+            terms=tuple(PlannedTerm(t.name, t.size, t.std, t.gain) for t in message.terms),
+            seconds=seconds_of(message.search_time),
             status=status,
             message=message.message,
             seed=int(message.seed),
             **numbers,
         ),
     )
-    return ReceivedPlan(message.plan_id, plan)
+    purpose = {v: k for k, v in PURPOSE.items()}.get(message.purpose)
+    if purpose is None:
+        raise InputError("purpose", message.purpose, "Plan.FIT or Plan.VALIDATION")
+    return ReceivedPlan(message.plan_id, plan, message.campaign_id, purpose)
 
 
-def check_rows(field: str, flat: ArrayLike, joints: Sequence[str], least: int = 1) -> FloatArray:
-    """(rows, joints) [rad | m] from a row-major list of finite numbers.
+def check_rows(
+    field: str, given: Sequence[JointConfiguration], joints: Sequence[str], least: int = 1
+) -> FloatArray:
+    """(rows, joints) [rad | m] from configurations of finite numbers.
 
     Raises:
-        InputError: The length is no multiple of the number of joints, or too large, or a number is not finite.
+        InputError: There are too many or too few, or one has another number of joints, or one is not finite.
     """
-    values = np.asarray(flat, dtype=float).ravel()
-    n = len(joints)
-    if values.size % n or not least * n <= values.size <= MOST_ROWS * n:
-        expected = f"rows of {n} numbers, joints in the order {', '.join(joints)}, {least} to {MOST_ROWS} rows"
-        raise InputError(field, f"{values.size} numbers", expected)
-    rows = values.reshape(-1, n)
-    return check_array(field, rows, (None, n), meaning="joints in rad or m")
+    if not least <= len(given) <= MOST_ROWS:
+        raise InputError(field, f"{len(given)} configurations", f"{least} to {MOST_ROWS}")
+    for row, one in enumerate(given):
+        if len(one.positions) != len(joints):
+            expected = f"{len(joints)} numbers, joints in the order {', '.join(joints)}"
+            raise InputError(f"{field}[{row}].positions", f"{len(one.positions)} numbers", expected)
+    rows = np.array([one.positions for one in given]).reshape(-1, len(joints))
+    return check_array(field, rows, (None, len(joints)), meaning="joints in rad or m")
 
 
 def joints_message(names: Sequence[str], positions: FloatArray, stamp: int) -> JointState:
@@ -218,6 +263,8 @@ def measurement_message(
     status: str = ACCEPTED,
     reason: str = "",
     plan_id: str = "",
+    campaign_id: str = "",
+    purpose: str = FIT,
     index: int | None = None,
     repetition: int = 0,
     number: int = 0,
@@ -227,12 +274,14 @@ def measurement_message(
     message = Measurement(
         id=number,
         plan_id=plan_id,
+        campaign_id=campaign_id,
+        purpose=PURPOSE[purpose],
         configuration_index=Measurement.UNPLANNED if index is None else index,
         repetition=repetition,
         joint_names=list(joint_names),
-        joint_positions=acquired.joints.tolist(),
+        configuration=JointConfiguration(positions=acquired.joints.tolist()),
         samples=acquired.samples.tolist(),
-        duration=(acquired.end - acquired.start) / NANO,
+        duration=duration_message((acquired.end - acquired.start) / NANO),
         status=MEASUREMENT_STATUS[status],
         unused_targets=list(unused),
         reason=reason,
@@ -284,10 +333,8 @@ def estimate_to_message(estimate: Any, frame_id: str, **others: Any) -> Calibrat
         "deviation": estimate.fit.deviations,
         "std": estimate.fit.std,
         "covariance": estimate.fit.covariance,
-        "test_poses": estimate.accuracy.test_poses,
         "predicted_accuracy": estimate.accuracy.predicted,
     }
-    used = [t for t in estimate.terms if t.used]
     fields: dict[str, Any] = {k: np.asarray(v, float).ravel().tolist() for k, v in numbers.items()}
     fields |= {
         "robot": estimate.calibrated.name,
@@ -301,20 +348,30 @@ def estimate_to_message(estimate: Any, frame_id: str, **others: Any) -> Calibrat
         "residual_rms_before": float(estimate.residuals.before.rms),
         "residual_rms_after": float(estimate.residuals.after.rms),
         "left_out_rms": float(estimate.left_out.rms),
+        "left_out_max": float(estimate.left_out.max),
         "left_out_predicted_rms": float(estimate.left_out.predicted_rms),
-        "terms": [t.name for t in used],
-        "term_sizes": [float(t.size) for t in used],
+        "terms": [term_message(t, t.used) for t in estimate.terms],
+        "joint_names": list(estimate.calibrated.joint_names),
+        "test_poses": rows_message(np.asarray(estimate.accuracy.test_poses, float)),
         "accuracy_frame": estimate.accuracy.frame,
         "status": ESTIMATE_STATUS[estimate.fit.status],
         "message": in_ros(estimate.fit.message),
         "condition": NAN,
         "outliers": len(estimate.points.rejected),
-        "verdict": estimate.verdict.level,
-        "reasons": reasons_of(estimate.verdict),
+        "verdict": verdict_message(estimate.verdict),
     }
     message = CalibrationEstimate(**(fields | others))
     message.header.frame_id = frame_id
     return message
+
+
+def verdict_message(verdict: Verdict) -> VerdictMessage:
+    """A verdict as message."""
+    reasons = [
+        ReasonMessage(level=LEVELS[r.level], code=r.code, text=in_ros(r.text), advice=in_ros(r.advice))
+        for r in verdict.reasons
+    ]
+    return VerdictMessage(level=LEVELS[verdict.level], reasons=reasons)
 
 
 def reasons_of(verdict: Verdict) -> list[str]:

@@ -1,21 +1,24 @@
 """From a request for a plan to a plan, or to a refusal that names the field: no node, no executor.
 
-The request is the service's or the action's; their fields are the same. It comes from anyone, so the robot must
+The request is the same for service and action. It comes from anyone, so the robot must
 be the node's own or a shipped one (never a path), and sizes are bounded.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Duration
+from calib_planner_msgs.msg import PlanRequest
 
 from calib_planner.arrays import FloatArray
+from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.io import config_folder, planned_error_model, read_constraints
+from calib_planner.io import NAMED_MODELS, config_folder, planned_error_model, read_constraints
 from calib_planner.planning import (
     Callback,
     Candidates,
@@ -28,7 +31,7 @@ from calib_planner.planning import (
     plan_for_time,
 )
 from calib_planner.robot import Robot
-from calib_planner.ros.messages import check_rows, pace_of
+from calib_planner.ros.messages import check_rows, pace_of, seconds_of
 from calib_planner.ros.model import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PlannerParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
@@ -61,7 +64,7 @@ class Answer:
 
 
 def answer(
-    request: Any,
+    request: PlanRequest,
     settings: PlannerParameters,
     own: Model | NotReady,
     callback: Callback | None = None,
@@ -84,12 +87,17 @@ def answer(
 
 
 def _planned(
-    problem: PlanProblem, request: Any, settings: PlannerParameters, model: Model, callback: Callback | None
+    problem: PlanProblem,
+    request: PlanRequest,
+    settings: PlannerParameters,
+    model: Model,
+    callback: Callback | None,
 ) -> Plan:
     """The plan of as many configurations as the request wants, or for the time of the node's parameters."""
-    if settings.time_budget == 0 or int(request.configurations):
+    budget = _number(request, settings, "time_budget")
+    if budget == 0 or int(request.configurations):
         return plan(problem, callback)
-    return plan_for_time(problem, plan_pace(settings, model), settings.time_budget, callback=callback).plan
+    return plan_for_time(problem, plan_pace(settings, model), budget, callback=callback).plan
 
 
 def plan_pace(settings: PlannerParameters, model: Model) -> Pace:
@@ -98,7 +106,7 @@ def plan_pace(settings: PlannerParameters, model: Model) -> Pace:
     return pace_of(model.robot, *speeds, settings.dwell, settings.settle)
 
 
-def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanProblem:
+def problem_of(request: PlanRequest, settings: PlannerParameters, model: Model) -> PlanProblem:
     """The library's problem of a request; zero and empty fields take the node's defaults.
 
     Raises:
@@ -128,7 +136,8 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
         noise=noise,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        error_model=planned_error_model(settings.error_model, robot, noise),
+        error_model=planned_error_model(_word(request, settings, "error_model", NAMED_MODELS), robot, noise),
+        accuracy_frame=_word(request, settings, "accuracy_frame", ACCURACIES),
         search=Search(
             starts=settings.starts or None,
             seed=int(request.seed),
@@ -138,15 +147,24 @@ def problem_of(request: Any, settings: PlannerParameters, model: Model) -> PlanP
     )
 
 
-def _number(request: Any, settings: PlannerParameters, name: str) -> float:
+def _number(request: PlanRequest, settings: PlannerParameters, name: str) -> float:
     """A number of the request, in the range of the node's parameter of that name; for 0 the parameter's value."""
-    value = float(getattr(request, name))
+    given = getattr(request, name)
+    value = seconds_of(given) if isinstance(given, Duration) else float(given)
     if value == 0:
         return float(getattr(settings, name))
     low, high, unit = (RANGES[name][key] for key in ("low", "high", "unit"))
     if not low <= value <= high:
         raise InputError(name, value, f"0 (the node's default), or {low:g} to {high:.15g} {unit}")
     return value
+
+
+def _word(request: PlanRequest, settings: PlannerParameters, name: str, valid: Sequence[str]) -> str:
+    """A word of the request, one of ``valid``; for an empty one the value of the parameter of that name."""
+    word = str(getattr(request, name))
+    if word and word not in valid:
+        raise InputError(name, brief(word, 100), f"empty (the node's default), or one of: {', '.join(valid)}")
+    return word or str(getattr(settings, name))
 
 
 def constraints_of(settings: PlanParameters, robot: Robot) -> tuple[Constraint, ...]:
@@ -175,8 +193,8 @@ def file_in(folder: Path, name: str, field: str) -> Path:
     return path
 
 
-def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> Candidates | None:
-    if not len(request.candidates):
+def _candidates(request: PlanRequest, settings: PlannerParameters, robot: Robot) -> Candidates | None:
+    if not request.candidates:
         return None
     rows = check_rows("candidates", request.candidates, robot.joint_names)
     if len(rows) > settings.most_candidates:
@@ -186,7 +204,7 @@ def _candidates(request: Any, settings: PlannerParameters, robot: Robot) -> Cand
     return Candidates(rows)
 
 
-def _weights(request: Any) -> FloatArray | None:
+def _weights(request: PlanRequest) -> FloatArray | None:
     """(t,) weights, divided by the largest, since only ratios matter and sums of huge weights overflow."""
     given = np.asarray(request.test_pose_weights, float)
     if not given.size:
@@ -195,7 +213,7 @@ def _weights(request: Any) -> FloatArray | None:
     return given / largest if 0 < largest < np.inf else given
 
 
-def _model(request: Any, settings: PlannerParameters, own: Model | NotReady) -> Model:
+def _model(request: PlanRequest, settings: PlannerParameters, own: Model | NotReady) -> Model:
     """The robot of a request: the node's own, or the shipped one that it names."""
     names = list(request.parameters)
     if len(names) > MOST_PARAMETERS:

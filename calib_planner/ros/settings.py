@@ -89,6 +89,7 @@ class PlannerParameters(PlanParameters):
     error_model: str = parameter(
         "", ERROR_MODEL + "; empty = typical, but paper for the robots of the paper", read_only=True
     )
+    accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
     constraints: str = at_configure("", CONSTRAINTS)
     joint_speed: float = parameter(0.5, "largest speed of turning joints on ~/trajectory", "rad/s", 1e-3, 100.0)
     slide_speed: float = parameter(0.1, "largest speed of sliding joints on ~/trajectory", "m/s", 1e-4, 100.0)

@@ -9,8 +9,9 @@ import threading
 from collections.abc import Callable
 
 import numpy as np
+from builtin_interfaces.msg import Duration
 from calib_planner_msgs.action import ExecutePlan
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, JointConfiguration, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from geometry_msgs.msg import Point
 from rclpy.action import CancelResponse
@@ -86,9 +87,9 @@ class FakeCell(Node):
             return kind(status=kind.CANCELLED, message="stopped on request")
         if answer in STATUS:
             if answer == "nonsense":
-                goal.publish_feedback(
-                    ExecutePlan.Feedback(index=2**32 - 1, phase="x" * 10**6, seconds=float("nan"))
-                )
+                feedback = ExecutePlan.Feedback(index=2**32 - 1, phase=255)
+                feedback.elapsed = Duration(sec=-(2**31), nanosec=2**32 - 1)
+                goal.publish_feedback(feedback)
             goal.abort()
             words = "x" * 10**6 if answer == "nonsense" else f"cannot go there: {answer}"
             return kind(status=STATUS[answer], message=words)
@@ -114,7 +115,7 @@ class FakeCell(Node):
             plan_id=plan.plan_id,
             configuration_index=int(np.argmin(np.abs(rows - q).max(axis=1))),
             joint_names=list(self.robot.joint_names),
-            joint_positions=q.tolist(),
+            configuration=JointConfiguration(positions=q.tolist()),
             points=[Point(x=point[0], y=point[1], z=point[2])],
             status=Measurement.ACCEPTED if accepted else Measurement.REJECTED_MOVED,
             reason="" if accepted else "the target moved",

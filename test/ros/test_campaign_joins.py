@@ -69,7 +69,7 @@ def test_the_identifier_is_told_the_fit_that_grew(bench: Bench, cell: FakeCell, 
     state = desk.node.campaign
     plan = next(m for m in reversed(cell.plans) if "-fit-" in m.plan_id)
     np.testing.assert_array_equal(
-        np.unique(np.reshape(plan.configurations, (-1, 2)), axis=0),
+        np.unique([c.positions for c in plan.configurations], axis=0),
         np.unique([r.q for r in state.measurements_of(FIT)], axis=0),
     )
     numbers = [r.number for r in state.measurements]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench import Bench
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, JointConfiguration, Measurement, Verdict
 from calib_planner_msgs.msg import Plan as PlanMessage
 from desk import ASKED, NAME, Desk, S
 from fake_cell import FakeCell
@@ -56,7 +56,8 @@ def test_a_campaign_with_simulator_and_identifier(bench: Bench, tmp_path: Path) 
     assert desk.now.state == S.IDLE and "start" in desk.now.reason
     assert desk.call("start")[0]
     done = desk.until(S.DONE, 90.0)
-    assert done.outcome == S.OUTCOME_REACHED and done.verdict in ("PASS", "WARN") and done.reasons
+    assert done.outcome == S.OUTCOME_REACHED and done.verdict.reasons
+    assert done.verdict.level in (Verdict.PASS, Verdict.WARN)
     assert done.predicted_accuracy <= done.required_accuracy == 5e-6
     assert done.validated == 3 and done.measured + done.validated <= done.budget
     assert list(done.round_measured) == sorted(done.round_measured) and done.round == len(done.round_accuracy)
@@ -239,7 +240,8 @@ def test_a_robot_that_can_go_nowhere_ends_it(bench: Bench, cell: FakeCell) -> No
     desk = Desk(bench, most_failures=4)
     assert desk.call("start")[0]
     done = desk.until(S.DONE, 60.0)
-    assert done.outcome == S.OUTCOME_UNREACHABLE and done.verdict == "FAIL" and "cannot go there" in done.reason
+    assert done.outcome == S.OUTCOME_UNREACHABLE and done.verdict.level == Verdict.FAIL
+    assert "cannot go there" in done.reason
     assert done.measured == 0 and done.excluded == 5
 
 
@@ -313,8 +315,8 @@ def test_undone_measurements_are_made_again_and_nonsense_is_refused(bench: Bench
     nan = float("nan")
     rubbish: list[dict[str, Any]] = [
         {"number": 100, "joint_names": ["a", "b"]},
-        {"number": 101, "joint_positions": [nan, nan]},
-        {"number": 102, "joint_positions": [0.0] * 10_000},
+        {"number": 101, "configuration": JointConfiguration(positions=[nan, nan])},
+        {"number": 102, "configuration": JointConfiguration(positions=[0.0] * 10_000)},
         {"number": 103, "configuration_index": 4_000_000_000},
         {"number": 104, "points": []},
         {"number": 105, "plan_id": "another"},

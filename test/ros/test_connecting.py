@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState
 from calib_planner import Robot
 from calib_planner.acquisition import NANO
 from calib_planner.io import config_folder
-from calib_planner.ros.messages import nanoseconds, plan_to_message
+from calib_planner.ros.messages import duration_message, nanoseconds, plan_to_message
 from calib_planner.ros.parameters import STREAM_IN
 from calib_planner.ros.settings import SimulatorParameters
 
@@ -253,7 +253,7 @@ def test_the_executor_drives_a_controller(
     assert (result.status, result.executed) == (result.SUCCESS, 4), result.message
     # Twice at each, and away in between.
     assert [bool(np.allclose(v, Q[0])) for v in controller.visited[:3]] == [True, False, True]
-    assert {f.feedback.phase for f in feedback} == {"moving", "measuring"}
+    assert {f.feedback.phase for f in feedback} == {ExecutePlan.Feedback.MOVING, ExecutePlan.Feedback.MEASURING}
     assert len(feedback) > 8, "signs of life within a phase"
     controller.fail = "path tolerance"
     result = run(goal)
@@ -276,10 +276,12 @@ def test_the_executor_does_one_plan_at_a_time_and_can_be_stopped(
     bench: Bench, executor: tuple[Controller, Any, Any]
 ) -> None:
     client = bench.action(ExecutePlan, "plan_executor/execute_plan")
-    goal = ExecutePlan.Goal(plan=plan_to_message(plan_of(ROBOT, Q, 2), "p", 0, "base"), dwell=60.0)
+    goal = ExecutePlan.Goal(
+        plan=plan_to_message(plan_of(ROBOT, Q, 2), "p", 0, "base"), dwell=duration_message(60.0)
+    )
     feedback: list[Any] = []
     handle = bench.goal(client, goal, feedback_callback=feedback.append)
-    bench.wait(lambda: feedback and feedback[-1].feedback.phase == "measuring")
+    bench.wait(lambda: feedback and feedback[-1].feedback.phase == ExecutePlan.Feedback.MEASURING)
     second = bench.future(bench.goal(client, goal).get_result_async()).result
     assert second.status == second.BUSY and second.executed == 0
     bench.future(handle.cancel_goal_async())

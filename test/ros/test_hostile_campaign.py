@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bench import Bench
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, JointConfiguration, Measurement
 from desk import ASKED, NAME, Desk, S
 from fake_cell import FakeCell
 from geometry_msgs.msg import Point
@@ -81,7 +81,7 @@ class Attack:
             "plan_id": plan.plan_id,
             "configuration_index": self.node._measuring._plan.numbers.index(visit.action.index),
             "joint_names": ["q1", "q2"],
-            "joint_positions": visit.action.q.tolist(),
+            "configuration": JointConfiguration(positions=visit.action.q.tolist()),
             "points": [point],
             "status": Measurement.ACCEPTED,
         }
@@ -128,22 +128,27 @@ def attack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attack]:
 
 # ── who says to be the identifier ────────────────────────────────────────────────────────────────────
 
+
+def at(positions: list[float]) -> JointConfiguration:
+    return JointConfiguration(positions=positions)
+
+
 REFUSED: dict[str, dict[str, Any]] = {
-    "10 000 joints": {"joint_names": [f"j{i}" for i in range(10_000)], "joint_positions": [0.0] * 10_000},
-    "a million positions": {"joint_positions": [0.0] * BIG},
-    "too few": {"joint_positions": [0.1]},
-    "no joints": {"joint_names": [], "joint_positions": []},
+    "10 000 joints": {"joint_names": [f"j{i}" for i in range(10_000)], "configuration": at([0.0] * 10_000)},
+    "a million positions": {"configuration": at([0.0] * BIG)},
+    "too few": {"configuration": at([0.1])},
+    "no joints": {"joint_names": [], "configuration": at([])},
     "twice": {"joint_names": ["q1", "q1"]},
     "empty names": {"joint_names": ["", ""]},
     "a long name": {"joint_names": ["q1", "x" * BIG]},
-    "NaN": {"joint_positions": [NAN, NAN]},
-    "infinite": {"joint_positions": [INF, 0.0]},
+    "NaN": {"configuration": at([NAN, NAN])},
+    "infinite": {"configuration": at([INF, 0.0])},
     "no points": {"points": []},
     "100 000 points": {"points": [Point()] * 100_000},
     "NaN points": {"points": [Point(x=NAN, y=NAN, z=NAN)]},
     "infinite points": {"points": [Point(x=INF)]},
     "points far beyond": {"points": [Point(x=1e308, y=NAN, z=-1e308)]},
-    "joints far beyond": {"joint_positions": [1e308, 0.0]},
+    "joints far beyond": {"configuration": at([1e308, 0.0])},
 }
 
 

@@ -12,15 +12,16 @@ from typing import Any
 
 import pytest
 from bench import Bench
-from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Duration, Time
 from calib_planner_msgs.action import ExecutePlan, PlanCalibration
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement, PlanRequest
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration as PlanService
 from calib_planner_msgs.srv import UndoMeasurement
 from geometry_msgs.msg import PointStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from poses import poses
 from rcl_interfaces.msg import Log, ParameterType, ParameterValue
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
@@ -49,7 +50,7 @@ PATHS = (
     "x" * 10**6,
 )
 BIG = 10**6
-POSE = [0.3, 0.5]
+POSE = poses([0.3, 0.5])
 
 
 class Cell:
@@ -79,7 +80,8 @@ class Cell:
         bench.wait(lambda: self.estimates)
 
     def request(self, **changes: Any) -> PlanService.Request:
-        return PlanService.Request(**({"test_poses": POSE, "configurations": 3} | changes))
+        wanted = PlanRequest(**({"test_poses": POSE, "configurations": 3} | changes))
+        return PlanService.Request(request=wanted)
 
     def ask(self, **changes: Any) -> PlanService.Response:
         return self.bench.call(PlanService, f"{PLANNER}/request_plan", self.request(**changes), 30.0)
@@ -168,9 +170,9 @@ def test_after_points(cell: Cell) -> None:
 # ── plans ────────────────────────────────────────────────────────────────────────────────────────────
 
 PLANS: dict[str, dict[str, Any]] = {
-    "a million numbers": {"configurations": [0.5] * BIG},
-    "NaN": {"configurations": [float("nan")] * 10},
-    "wrong length": {"configurations": [0.0] * 9},
+    "a million joints": {"configurations": poses([0.5] * BIG)},
+    "NaN": {"configurations": poses([float("nan")] * 2) * 5},
+    "wrong length": {"configurations": poses([0.0] * 2) * 4},
     "10 000 joints": {"joint_names": [f"j{i}" for i in range(10_000)]},
     "empty names": {"joint_names": ["", ""]},
     "twice": {"joint_names": ["q1", "q1"]},
@@ -180,9 +182,11 @@ PLANS: dict[str, dict[str, Any]] = {
     "another robot": {"robot": PATHS[0]},
     "100 000 parameters": {"parameters": [f"p{i}" for i in range(100_000)]},
     "a long id": {"plan_id": "x" * BIG},
+    "20 000 configurations": {"configurations": poses([0.5, 0.5]) * 20_000},
+    "no purpose": {"purpose": 7},
     "no status": {"status": 255},
     "sigma": {"sigma": float("nan")},
-    "poses": {"test_poses": [float("inf")] * 10},
+    "poses": {"test_poses": poses([float("inf")] * 2) * 5},
 }
 
 
@@ -202,8 +206,10 @@ def test_plans(cell: Cell, planned: Plan, case: str) -> None:
     cell.check()
 
 
-@pytest.mark.parametrize("dwell", [float("nan"), float("inf"), -1.0, 1e308])
-def test_dwell(cell: Cell, planned: Plan, dwell: float) -> None:
+@pytest.mark.parametrize(
+    "dwell", [Duration(sec=-1), Duration(sec=601), Duration(sec=2**31 - 1, nanosec=2**32 - 1)]
+)
+def test_dwell(cell: Cell, planned: Plan, dwell: Duration) -> None:
     client = cell.bench.action(ExecutePlan, f"{SIMULATOR}/execute_plan")
     goal = ExecutePlan.Goal(plan=plan_to_message(planned, "p", 0, "base"), dwell=dwell)
     result = cell.bench.future(cell.bench.goal(client, goal).get_result_async()).result
@@ -213,15 +219,17 @@ def test_dwell(cell: Cell, planned: Plan, dwell: float) -> None:
 # ── requests ─────────────────────────────────────────────────────────────────────────────────────────
 
 REQUESTS: dict[str, dict[str, Any]] = {
-    "a million poses": {"test_poses": [0.1] * BIG},
-    "NaN": {"test_poses": [float("nan")] * 2},
-    "odd": {"test_poses": [0.1] * 3},
-    "a million candidates": {"candidates": [0.1] * BIG},
+    "20 000 poses": {"test_poses": poses([0.1, 0.1]) * 20_000},
+    "a million joints": {"test_poses": poses([0.1] * BIG)},
+    "NaN": {"test_poses": poses([float("nan")] * 2)},
+    "odd": {"test_poses": poses([0.1] * 3)},
+    "20 000 candidates": {"candidates": poses([0.1, 0.1]) * 20_000},
+    "a million joints of a candidate": {"candidates": poses([0.1] * BIG)},
     "configurations": {"configurations": 2**32 - 1},
     "repetitions": {"repetitions": 2**32 - 1},
     "weights": {"test_pose_weights": [float("inf")]},
     "sigma": {"sigma": -1.0},
-    "time": {"time_limit": float("nan")},
+    "time": {"time_limit": Duration(sec=-5)},
     "criterion": {"criterion": "x" * 100_000},
     "names": {"parameters": [f"p{i}" for i in range(100_000)]},
     **{f"robot {p[:16]!r}": {"robot": p} for p in PATHS if "\0" not in p},
@@ -234,7 +242,7 @@ def test_requests(cell: Cell, case: str) -> None:
     assert answer.status == PlanService.Response.INVALID_REQUEST, answer
     assert answer.field and 0 < len(answer.message) < 3000
     client = cell.bench.action(PlanCalibration, f"{PLANNER}/plan")
-    goal = PlanCalibration.Goal(**({"test_poses": POSE, "configurations": 3} | REQUESTS[case]))
+    goal = PlanCalibration.Goal(request=cell.request(**REQUESTS[case]).request)
     result = cell.bench.future(cell.bench.goal(client, goal).get_result_async()).result
     assert (result.status, result.field) == (answer.status, answer.field)
     cell.check()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bench import Bench
 from builtin_interfaces.msg import Time
-from calib_planner_msgs.msg import Measurement
+from calib_planner_msgs.msg import Measurement, Verdict
 from calib_planner_msgs.srv import UndoMeasurement
 from diagnostic_msgs.msg import DiagnosticArray
 from robots import plan_of, random_configurations
@@ -149,7 +149,7 @@ def test_an_outlier_is_published_again_and_can_be_withdrawn(shift: Shift) -> Non
     shift.bench.wait(lambda: shift.estimates[-1].outliers == 1)
     last = shift.estimates[-1]
     assert last.rejected == 1 and last.configurations == 8 and not last.complete
-    assert last.verdict in ("PASS", "WARN", "FAIL") and last.condition >= 1.0
+    assert last.verdict.level in (Verdict.PASS, Verdict.WARN, Verdict.FAIL) and last.condition >= 1.0
 
     undo = UndoMeasurement.Request(id=again.id)
     answer = shift.bench.call(UndoMeasurement, f"{NAME}/undo_measurement", undo, attempts=1)

@@ -9,31 +9,34 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Duration
 from calib_planner_msgs.action import PlanCalibration as PlanAction
+from calib_planner_msgs.msg import PlanRequest
 from calib_planner_msgs.srv import PlanCalibration
+from poses import poses
 from robots import random_configurations
 
 from calib_planner import PlanProblem, Robot, plan
 from calib_planner.errors import InputError
 from calib_planner.planning import Search, timetable
-from calib_planner.ros.messages import trajectory_message
+from calib_planner.ros.messages import duration_message, rows_message, trajectory_message
 from calib_planner.ros.model import NotReady, described_model, shipped_model
 from calib_planner.ros.planning import answer, plan_pace
 from calib_planner.ros.settings import PlannerParameters
 
 SETTINGS = PlannerParameters(robot="planar_2r", starts=4, configurations=4, most_configurations=50)
 OWN = shipped_model("planar_2r", "lengths+offsets", "")
-POSE = [0.3, 0.5]
+POSE = poses([0.3, 0.5])
 
 BAD: list[tuple[dict[str, Any], str, str]] = [
     ({"test_poses": []}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [0.1]}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [0.1, 0.2, 0.3]}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [math.nan, 0.0]}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [math.inf, 0.0]}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [30.0, 0.0]}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [0.0] * 4000}, "INVALID_REQUEST", "test_poses"),
-    ({"test_poses": [0.0] * 100_000}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([0.1])}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([0.1, 0.2], [0.3])}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([math.nan, 0.0])}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([math.inf, 0.0])}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([30.0, 0.0])}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([0.0, 0.0]) * 2000}, "INVALID_REQUEST", "test_poses"),
+    ({"test_poses": poses([0.0] * 100_000)}, "INVALID_REQUEST", "test_poses"),
     ({"test_pose_weights": [1.0, 1.0]}, "INVALID_REQUEST", "test_pose_weights"),
     ({"test_pose_weights": [-1.0]}, "INVALID_REQUEST", "test_pose_weights"),
     ({"test_pose_weights": [0.0]}, "INVALID_REQUEST", "test_pose_weights"),
@@ -52,14 +55,17 @@ BAD: list[tuple[dict[str, Any], str, str]] = [
     ({"sigma": math.nan}, "INVALID_REQUEST", "sigma"),
     ({"sigma": 5.0}, "INVALID_REQUEST", "sigma"),
     ({"sigma": 1e-300}, "INVALID_REQUEST", "sigma"),
-    ({"candidates": [0.1, 100.0] * 9}, "INVALID_REQUEST", "candidates"),
-    ({"time_limit": -1.0}, "INVALID_REQUEST", "time_limit"),
-    ({"time_limit": math.inf}, "INVALID_REQUEST", "time_limit"),
-    ({"candidates": [0.1, 0.2, 0.3]}, "INVALID_REQUEST", "candidates"),
-    ({"candidates": [0.1, math.nan] * 9}, "INVALID_REQUEST", "candidates"),
-    ({"candidates": [0.1, 0.2]}, "INVALID_REQUEST", "candidates"),
-    ({"candidates": [0.1, 0.2] * 2001}, "INVALID_REQUEST", "candidates"),
-    ({"candidates": [0.1] * 100_000}, "INVALID_REQUEST", "candidates"),
+    ({"time_budget": Duration(sec=-(2**31))}, "INVALID_REQUEST", "time_budget"),
+    ({"error_model": "/etc/passwd"}, "INVALID_REQUEST", "error_model"),
+    ({"accuracy_frame": "moon"}, "INVALID_REQUEST", "accuracy_frame"),
+    ({"candidates": poses([0.1, 100.0]) * 9}, "INVALID_REQUEST", "candidates"),
+    ({"time_limit": Duration(sec=-1)}, "INVALID_REQUEST", "time_limit"),
+    ({"time_limit": duration_message(math.inf)}, "INVALID_REQUEST", "time_limit"),
+    ({"candidates": poses([0.1, 0.2], [0.3])}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": poses([0.1, math.nan]) * 9}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": poses([0.1, 0.2])}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": poses([0.1, 0.2]) * 2001}, "INVALID_REQUEST", "candidates"),
+    ({"candidates": poses([0.1] * 100_000)}, "INVALID_REQUEST", "candidates"),
     ({"configurations": 1}, "INFEASIBLE", "configurations"),
 ]
 
@@ -70,14 +76,14 @@ def identifier(case: Any) -> str:
 
 def test_a_long_chain_and_many_configurations_are_refused_before_memory_is() -> None:
     settings = replace(SETTINGS, most_configurations=10_000)
-    request = PlanCalibration.Request(test_poses=[0.1] * 60, configurations=51)
+    request = PlanRequest(test_poses=poses([0.1] * 60), configurations=51)
     found = answer(request, settings, described_model(urdf(60)))
     assert (found.status, found.field) == ("INVALID_REQUEST", "configurations") and "at most 50" in found.message
 
 
 @pytest.mark.parametrize(("change", "status", "field"), BAD, ids=identifier)
 def test_bad_requests(change: dict[str, Any], status: str, field: str) -> None:
-    request = PlanCalibration.Request(**({"test_poses": POSE} | change))
+    request = PlanRequest(**({"test_poses": POSE} | change))
     found = answer(request, SETTINGS, OWN)
     assert (found.status, found.field) == (status, field), found.message
     assert found.plan is None and 10 < len(found.message) < 2000
@@ -85,7 +91,7 @@ def test_bad_requests(change: dict[str, Any], status: str, field: str) -> None:
 
 
 def test_defaults_and_seed() -> None:
-    request = PlanCalibration.Request(test_poses=POSE, seed=3)
+    request = PlanRequest(test_poses=POSE, seed=3)
     a, b = answer(request, SETTINGS, OWN), answer(request, SETTINGS, OWN)
     assert a.status == "SUCCESS" and a.plan is not None and b.plan is not None
     assert len(a.plan.configurations) == 4 and a.plan.sigma == SETTINGS.sigma
@@ -94,13 +100,13 @@ def test_defaults_and_seed() -> None:
 
 def test_another_shipped_robot() -> None:
     pose = list(Robot.load("kuka_kr270").joint_limits.mean(axis=1))
-    request = PlanCalibration.Request(robot="kuka_kr270", test_poses=pose, configurations=3)
+    request = PlanRequest(robot="kuka_kr270", test_poses=poses(pose), configurations=3)
     found = answer(request, SETTINGS, OWN)
     assert found.plan is not None and found.plan.robot == "kuka_kr270"
 
 
 def test_cancelling_returns_the_best_so_far() -> None:
-    goal = PlanAction.Goal(test_poses=POSE, configurations=20)
+    goal = PlanRequest(test_poses=POSE, configurations=20)
     found = answer(goal, SETTINGS, OWN, lambda state: state.starts_done > 0)
     assert found.status == "CANCELLED" and found.plan is not None
     assert hasattr(PlanAction.Result, found.status)
@@ -108,14 +114,17 @@ def test_cancelling_returns_the_best_so_far() -> None:
 
 def test_a_plan_for_a_time_keeps_it_unless_the_request_says_how_many() -> None:
     settings = replace(SETTINGS, time_budget=200.0, joint_speed=0.2)
-    request = PlanCalibration.Request(test_poses=POSE)
+    request = PlanRequest(test_poses=POSE)
     own = answer(request, settings, OWN)
     assert own.plan is not None and own.plan.measurements > len(own.plan.configurations)
     pace = plan_pace(settings, OWN)
     assert 180.0 < timetable(own.plan, OWN.robot, pace).seconds <= 200.0
     points = trajectory_message(own.plan, OWN.robot, pace, "base").points
     assert points[-1].time_from_start.sec <= 200
-    counted = answer(PlanCalibration.Request(test_poses=POSE, configurations=3), settings, OWN).plan
+    asked = PlanRequest(test_poses=POSE, time_budget=duration_message(200.0))
+    same = answer(asked, replace(settings, time_budget=0.0), OWN).plan
+    assert same is not None and (same.configurations == own.plan.configurations).all()
+    counted = answer(PlanRequest(test_poses=POSE, configurations=3), settings, OWN).plan
     assert counted is not None and counted.measurements == 3
     told = answer(request, replace(settings, time_budget=5.0), OWN)
     assert told.status == "INFEASIBLE" and "too short" in told.message
@@ -124,9 +133,9 @@ def test_a_plan_for_a_time_keeps_it_unless_the_request_says_how_many() -> None:
 
 
 def test_it_is_the_library_s_plan() -> None:
-    request = PlanCalibration.Request(test_poses=POSE, seed=9)
+    request = PlanRequest(test_poses=POSE, seed=9)
     found = answer(request, SETTINGS, OWN)
-    wanted = plan(PlanProblem(OWN.robot, [POSE], 4, noise=SETTINGS.sigma, search=Search(starts=4, seed=9)))
+    wanted = plan(PlanProblem(OWN.robot, [[0.3, 0.5]], 4, noise=SETTINGS.sigma, search=Search(starts=4, seed=9)))
     assert found.plan is not None
     np.testing.assert_array_equal(found.plan.configurations, wanted.configurations)
     assert found.plan.quality.predicted_accuracy == wanted.quality.predicted_accuracy
@@ -134,7 +143,7 @@ def test_it_is_the_library_s_plan() -> None:
 
 def test_candidates_are_chosen_among() -> None:
     pool = random_configurations(OWN.robot, 40, 3)
-    request = PlanCalibration.Request(test_poses=POSE, candidates=pool.ravel().tolist())
+    request = PlanRequest(test_poses=POSE, candidates=rows_message(pool))
     found = answer(request, SETTINGS, OWN).plan
     assert found is not None
     assert all((pool == q).all(axis=1).any() for q in found.configurations)
@@ -143,7 +152,7 @@ def test_candidates_are_chosen_among() -> None:
 
 @pytest.mark.parametrize("scale", [1e-300, 1.0, 1e308])
 def test_only_relative_weights_matter(scale: float) -> None:
-    request = PlanCalibration.Request(test_poses=[*POSE, -0.4, 1.0], test_pose_weights=[scale, 0.5 * scale])
+    request = PlanRequest(test_poses=[*POSE, *poses([-0.4, 1.0])], test_pose_weights=[scale, 0.5 * scale])
     found = answer(request, SETTINGS, OWN).plan
     assert found is not None
     np.testing.assert_allclose(found.weights, [2 / 3, 1 / 3], rtol=1e-12)
@@ -151,9 +160,9 @@ def test_only_relative_weights_matter(scale: float) -> None:
 
 def test_without_a_robot_only_shipped_ones() -> None:
     nobody = NotReady("no robot yet: publish one")
-    found = answer(PlanCalibration.Request(test_poses=POSE), SETTINGS, nobody)
+    found = answer(PlanRequest(test_poses=POSE), SETTINGS, nobody)
     assert (found.status, found.field) == ("NOT_READY", "robot") and "publish one" in found.message
-    found = answer(PlanCalibration.Request(test_poses=POSE, robot="planar_2r"), SETTINGS, nobody)
+    found = answer(PlanRequest(test_poses=POSE, robot="planar_2r"), SETTINGS, nobody)
     assert found.status == "SUCCESS"
 
 
@@ -167,7 +176,7 @@ def with_constraints(folder: Path, name: str) -> PlannerParameters:
 def test_constraints_are_kept(tmp_path: Path) -> None:
     joint = OWN.robot.joint_names[1]
     (tmp_path / "cell.yaml").write_text(f"joint_range: {{{joint}: [0.2, 0.4]}}\n")
-    found = answer(PlanCalibration.Request(test_poses=POSE), with_constraints(tmp_path, "cell.yaml"), OWN).plan
+    found = answer(PlanRequest(test_poses=POSE), with_constraints(tmp_path, "cell.yaml"), OWN).plan
     assert found is not None
     assert (found.configurations[:, 1] >= 0.2).all() and (found.configurations[:, 1] <= 0.4).all()
 
@@ -182,14 +191,14 @@ def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / "secret.yaml").write_text("password: 1\n")
     (folder / "cell.yaml").write_text("workspace: {low: [-9, -9, -9], high: [9, 9, 9]}\n")
     (folder / "link.yaml").symlink_to(tmp_path / "secret.yaml")
-    found = answer(PlanCalibration.Request(test_poses=POSE), with_constraints(folder, name), OWN)
+    found = answer(PlanRequest(test_poses=POSE), with_constraints(folder, name), OWN)
     assert (found.status, found.field) == ("INVALID_REQUEST", "constraints")
     assert "password" not in found.message and "root:" not in found.message
 
 
 def test_a_file_with_tags_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cell.yaml").write_text("workspace: !!python/object/apply:os.system ['touch /tmp/never']\n")
-    found = answer(PlanCalibration.Request(test_poses=POSE), with_constraints(tmp_path, "cell.yaml"), OWN)
+    found = answer(PlanRequest(test_poses=POSE), with_constraints(tmp_path, "cell.yaml"), OWN)
     assert found.status == "INVALID_REQUEST" and "cell.yaml" in found.message
 
 
@@ -211,7 +220,7 @@ def urdf(joints: int, *, inside: str = "", limit: str = 'velocity="2.0"') -> str
 def test_a_described_robot_is_planned_for() -> None:
     model = described_model(urdf(3))
     assert model.robot.from_urdf and model.speeds.tolist() == [2.0] * 3
-    found = answer(PlanCalibration.Request(test_poses=[0.1, 0.2, 0.3]), SETTINGS, model)
+    found = answer(PlanRequest(test_poses=poses([0.1, 0.2, 0.3])), SETTINGS, model)
     assert found.status == "SUCCESS" and found.plan is not None and found.plan.joint_names == ("j0", "j1", "j2")
     assert np.isinf(described_model(urdf(3, limit="")).speeds).all()
 

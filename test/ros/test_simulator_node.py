@@ -14,6 +14,7 @@ from bench import Bench
 from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import Plan as PlanMessage
 from geometry_msgs.msg import PointStamped
+from poses import poses
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
@@ -22,7 +23,7 @@ from calib_planner.acquisition import NANO
 from calib_planner.error_model import typical
 from calib_planner.io import write_error_model
 from calib_planner.planning import Search
-from calib_planner.ros.messages import nanoseconds, plan_to_message
+from calib_planner.ros.messages import duration_message, nanoseconds, plan_to_message, rows_message
 from calib_planner.ros.nodes import simulator as simulator_node
 from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import STREAM_IN
@@ -43,7 +44,7 @@ def goal_of(planned: Plan, **changes: Any) -> ExecutePlan.Goal:
     message = plan_to_message(planned, "p", 0, "base")
     for name, value in changes.items():
         setattr(message, name, value)
-    return ExecutePlan.Goal(plan=message, dwell=0.3)
+    return ExecutePlan.Goal(plan=message, dwell=duration_message(0.3))
 
 
 def test_it_visits_every_configuration(bench: Bench, planned: Plan) -> None:
@@ -58,7 +59,7 @@ def test_it_visits_every_configuration(bench: Bench, planned: Plan) -> None:
     result = bench.future(handle.get_result_async())
     assert result.status == GoalStatus.STATUS_SUCCEEDED
     assert (result.result.status, result.result.executed) == (Result.SUCCESS, 3)
-    assert {f.feedback.phase for f in feedback} <= {"moving", "measuring"}
+    assert {f.feedback.phase for f in feedback} <= {ExecutePlan.Feedback.MOVING, ExecutePlan.Feedback.MEASURING}
     assert {f.feedback.index for f in feedback} == {0, 1, 2}
 
     def seen(wanted: np.ndarray) -> bool:
@@ -95,7 +96,7 @@ def test_a_short_motion_is_seen_however_long_it_takes_to_think_of_it(
     states = bench.hear(JointState, "joint_states", STREAM_IN)
     bench.start(SimulatorNode, robot="planar_2r", joint_speed=12.0)
     client = bench.action(ExecutePlan, ACTION)
-    one = {"configurations": planned.configurations[0].tolist(), "repetitions": [1]}
+    one = {"configurations": poses(planned.configurations[0]), "repetitions": [1]}
 
     def off() -> np.ndarray:
         return np.abs(np.array([s.position for s in states]) - planned.configurations[0]).max(axis=1)
@@ -112,9 +113,9 @@ def test_a_short_motion_is_seen_however_long_it_takes_to_think_of_it(
     [
         {"robot": "kuka_kr270"},
         {"joint_names": ["q2", "q1"]},
-        {"configurations": [0.0] * 5},
-        {"configurations": [math.nan] * 6},
-        {"configurations": [100.0] * 6},
+        {"configurations": poses([0.0] * 5) * 3},
+        {"configurations": poses([math.nan] * 2) * 3},
+        {"configurations": poses([100.0] * 2) * 3},
         {"repetitions": [1]},
         {"status": PlanMessage.STATUS_EMPTY},
     ],
@@ -154,7 +155,7 @@ def test_a_plan_without_end_is_refused(bench: Bench, planned: Plan) -> None:
     bench.future(handle.cancel_goal_async())
     assert bench.future(handle.get_result_async()).result.status == Result.CANCELLED
     many = np.tile(planned.configurations, (34, 1))
-    flat = {"configurations": many.ravel().tolist(), "repetitions": [1000] * len(many)}
+    flat = {"configurations": rows_message(many), "repetitions": [1000] * len(many)}
     handle = bench.goal(client, goal_of(planned, **flat))
     result = bench.future(handle.get_result_async()).result
     assert result.status == Result.INVALID_PLAN and "repetitions" in result.message

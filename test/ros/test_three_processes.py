@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calib_planner_msgs.msg import CalibrationEstimate
+from calib_planner_msgs.msg import CalibrationEstimate, PlanRequest
 from calib_planner_msgs.srv import PlanCalibration
+from poses import poses
 
 from calib_planner import Robot
 from calib_planner.ros import demo
@@ -32,15 +33,15 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
         nodes.start("simulator_node", {"seed": SEED, "joint_speed": 12.0, "dwell": 0.7} | exact)
         client = DemoClient(domain, nodes.check)
         try:
-            request = PlanCalibration.Request(
+            request = PlanRequest(
                 robot="kuka_kr270",
                 parameters=["lengths+offsets"],
-                test_poses=[math.radians(x) for x in (0, -60, 90, 0, 45, 0)],
+                test_poses=poses(np.radians([0, -60, 90, 0, 45, 0])),
                 configurations=6,
                 sigma=3e-5 / math.sqrt(20),
                 seed=SEED,
             )
-            plan = client.request_plan(request)
+            plan = client.request_plan(PlanCalibration.Request(request=request))
             client.wait(lambda: client.identifier_has(plan.plan_id), 60.0, "estimate")
             client.execute(plan, 120.0)
             final = client.estimate
@@ -68,9 +69,10 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
         client = DemoClient(domain, nodes.check)
         try:
             client.wait(client._plan.service_is_ready, 60.0, "service")
-            pose = [0.0, -1.0, 1.5, 0.0, 0.8, 0.0]
-            long = PlanCalibration.Request(test_poses=pose, configurations=150, parameters=["full"])
-            busy = PlanCalibration.Request(test_poses=pose, configurations=3)
+            pose = poses([0.0, -1.0, 1.5, 0.0, 0.8, 0.0])
+            wanted = PlanRequest(test_poses=pose, configurations=150, parameters=["full"])
+            long = PlanCalibration.Request(request=wanted)
+            busy = PlanCalibration.Request(request=PlanRequest(test_poses=pose, configurations=3))
 
             def planning() -> bool:
                 client._plan.call_async(long)

@@ -9,11 +9,12 @@ import numpy as np
 from bench import Bench
 from builtin_interfaces.msg import Time
 from calib_planner_msgs.action import PlanCalibration as PlanAction
-from calib_planner_msgs.msg import CalibrationEstimate
+from calib_planner_msgs.msg import CalibrationEstimate, PlanRequest, Verdict
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import PlanCalibration
 from desk import NAME, Desk, S
 from fake_cell import FakeCell
+from poses import poses
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_planner import Robot, plan
@@ -34,13 +35,15 @@ def test_a_plan_with_constraints_is_the_library_s_by_service_and_action(bench: B
     (tmp_path / "cell.yaml").write_text(f"joint_range: {{{robot.joint_names[0]}: [-1.0, 1.0]}}\n")
     chosen = {"robot": "ur10e", "constraints": "cell.yaml", "constraints_folder": str(tmp_path), "settle": 1.0}
     bench.start(PlannerNode, **chosen)
-    request = {"test_poses": POSE, "configurations": 7, "seed": 2}
-    answer = bench.call(PlanCalibration, "calibration_planner/request_plan", PlanCalibration.Request(**request))
+    request = PlanRequest(test_poses=poses(POSE), configurations=7, seed=2)
+    answer = bench.call(
+        PlanCalibration, "calibration_planner/request_plan", PlanCalibration.Request(request=request)
+    )
     assert answer.status == PlanCalibration.Response.SUCCESS, answer.message
     model = shipped_model("ur10e", "lengths+offsets", "")
     settings = replace(PlannerParameters(), **chosen)
-    made = plan(problem_of(PlanCalibration.Request(**request), settings, model))
-    np.testing.assert_array_equal(answer.plan.configurations, made.configurations.ravel())
+    made = plan(problem_of(request, settings, model))
+    np.testing.assert_array_equal([c.positions for c in answer.plan.configurations], made.configurations)
     assert answer.plan.predicted_accuracy == made.quality.predicted_accuracy
     assert np.abs(made.configurations[:, 0]).max() <= 1.0 + 1e-9
     paths = bench.hear(JointTrajectory, "calibration_planner/trajectory", LATCHED)
@@ -50,7 +53,7 @@ def test_a_plan_with_constraints_is_the_library_s_by_service_and_action(bench: B
     np.testing.assert_allclose(times[::2], [row["arrive"] for row in sheet.timetable.rows()], atol=2e-9)
     np.testing.assert_allclose(times[1::2], np.add(times[::2], settings.settle + settings.dwell), atol=2e-9)
     assert paths[0].header.stamp == Time() and paths[0].header.frame_id == "base_link"
-    handle = bench.goal(bench.action(PlanAction, "calibration_planner/plan"), PlanAction.Goal(**request))
+    handle = bench.goal(bench.action(PlanAction, "calibration_planner/plan"), PlanAction.Goal(request=request))
     result = bench.future(handle.get_result_async()).result
     assert result.status == PlanAction.Result.SUCCESS
     assert result.plan.configurations == answer.plan.configurations
@@ -73,18 +76,20 @@ def test_a_campaign_with_a_robot_that_errs_in_every_way(bench: Bench) -> None:
     bench.start(TypicalCell)
     estimates = bench.hear(CalibrationEstimate, f"{NAME}/estimate", LATCHED)
     plans = bench.hear(PlanMessage, f"{NAME}/plan", LATCHED)
-    poses = " ".join(map(str, POSE))
-    asked = {"robot": "ur10e", "error_model": "typical", "test_poses": poses, "required_accuracy": 2.5e-4}
+    pose = " ".join(map(str, POSE))
+    asked = {"robot": "ur10e", "error_model": "typical", "test_poses": pose, "required_accuracy": 2.5e-4}
     desk = Desk(bench, **asked, batch=10, budget=30, validation=3, starts=1, sigma=1e-5)
     assert desk.call("start")[0]
     done = desk.until(S.DONE, 90.0)
     assert done.outcome == S.OUTCOME_REACHED and done.predicted_accuracy <= 2.5e-4, done
-    assert done.verdict in ("PASS", "WARN") and done.validated == 3
-    assert not any("--" in text for m in desk.heard for text in (m.reason, *m.reasons))
-    assert np.isfinite(done.round_accuracy[-1]) and done.validation_rms < 4 * done.validation_predicted
+    assert done.verdict.level in (Verdict.PASS, Verdict.WARN) and done.validated == 3
+    said = [text for m in desk.heard for text in (m.reason, *(r.text + r.advice for r in m.verdict.reasons))]
+    assert not any("--" in text for text in said)
+    assert np.isfinite(done.round_accuracy[-1]) and done.validation_rms < 4 * done.validation_predicted_rms
     bench.wait(lambda: estimates)
     found = estimates[-1]
-    assert {"placement", "gravity"} <= set(found.terms) and {"smooth", "short"} & set(found.terms)
+    terms = {t.name for t in found.terms if t.used}
+    assert {"placement", "gravity"} <= terms and {"smooth", "short"} & terms
     assert found.header.frame_id == "base_link"
     assert 4 <= found.configurations <= done.measured and found.left_out_rms < 4 * found.left_out_predicted_rms
     assert all(p.header.frame_id == "base_link" for p in plans)

@@ -28,7 +28,7 @@ from calib_planner.errors import CalibPlannerError
 from calib_planner.planning import Progress
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.markers import plan_markers
-from calib_planner.ros.messages import in_ros, no_plan, plan_to_message, trajectory_message
+from calib_planner.ros.messages import duration_message, in_ros, no_plan, plan_to_message, trajectory_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.planning import Answer, answer, constraints_of, plan_pace
@@ -125,8 +125,8 @@ class PlannerNode(ManagedNode[PlannerParameters]):
             return Answer("BUSY", "", "another request is being worked on: ask again later")
         began = time.perf_counter()
         try:
-            result = answer(request, self.settings.value, self._source.model, callback)
-            if result.plan is not None and self._source.refusal and not request.robot:
+            result = answer(request.request, self.settings.value, self._source.model, callback)
+            if result.plan is not None and self._source.refusal and not request.request.robot:
                 result = replace(result, message=f"{result.message}; {self._source.refusal}")
         except Exception as error:
             result = Answer("INTERNAL_ERROR", "", reason_of(error))
@@ -183,7 +183,7 @@ def feedback_message(state: Progress) -> PlanAction.Feedback:
         efficiency=bound / best,
         starts_done=state.starts_done,
         starts_total=state.starts_total,
-        seconds=state.seconds,
+        elapsed=duration_message(state.seconds),
     )
 
 

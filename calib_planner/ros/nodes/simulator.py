@@ -25,7 +25,13 @@ from calib_planner.errors import CalibPlannerError, InputError
 from calib_planner.io import config_folder, read_error_model, read_instrument
 from calib_planner.ros.executor import check_executable
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
-from calib_planner.ros.messages import joints_message, plan_from_message, point_message
+from calib_planner.ros.messages import (
+    duration_message,
+    joints_message,
+    plan_from_message,
+    point_message,
+    seconds_of,
+)
 from calib_planner.ros.model import load_shipped
 from calib_planner.ros.parameters import SENSOR_OUT
 from calib_planner.ros.rclpy_ext.run import run
@@ -128,7 +134,8 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def _execute(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
         plan = plan_from_message(goal.request.plan).plan
-        dwell = check_number("dwell", goal.request.dwell, low=0.0, high=600.0, unit="s; 0: the node's default")
+        asked = seconds_of(goal.request.dwell)
+        dwell = check_number("dwell", asked, low=0.0, high=600.0, unit="s; 0: the node's default")
         check_executable(plan, self.world.robot)
         tour = make_tour(
             self._itinerary.at(np.array([self.now])).joints[0],
@@ -166,10 +173,11 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             if goal.is_cancel_requested or self._work.closing.is_set():
                 return
             phase = tour.at(seconds)
-            words = "measuring" if phase.measuring else "moving"
-            goal.publish_feedback(
-                ExecutePlan.Feedback(index=phase.index, total=total, phase=words, seconds=seconds)
-            )
+            kind = ExecutePlan.Feedback
+            feedback = kind(index=phase.index, total=total, executed=tour.standstills(seconds))
+            feedback.phase = kind.MEASURING if phase.measuring else kind.MOVING
+            feedback.elapsed = duration_message(seconds)
+            goal.publish_feedback(feedback)
             self._work.closing.wait(FEEDBACK_PERIOD)
 
 
