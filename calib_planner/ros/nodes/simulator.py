@@ -170,7 +170,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             goal.publish_feedback(
                 ExecutePlan.Feedback(index=phase.index, total=total, phase=words, seconds=seconds)
             )
-            self._work.closing.wait(FEEDBACK_PERIOD)
+            self.rest(FEEDBACK_PERIOD, self._work.closing)
 
 
 def make_world(chosen: SimulatorParameters) -> World:
