@@ -1,12 +1,23 @@
-"""Package of the library, its command line and its ROS 2 nodes (ament_python)."""
+"""Package of the library, its command line and its ROS 2 nodes (ament_python).
 
+*The interfaces* are a package of their own in ``msg_defs``, since an ament_python package cannot generate any.
+colcon does not look for packages below another one, so that ``colcon build`` finds this package alone and installs
+it last: then it has the interfaces built here, by colcon itself, into the same workspace. Where colcon was told of
+both (``--base-paths``, or a link beside the checkout), or where they are installed already, nothing is built here.
+"""
+
+import os
 import platform
+import subprocess
 import sys
 from pathlib import Path
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.develop import develop
+from setuptools.command.install import install
 
 NAME = "calib_planner"
+INTERFACES = "calib_planner_msgs"
 PAPER = "calib_planner_paper"
 SHARE = f"share/{NAME}"
 
@@ -17,6 +28,61 @@ def shared_tree(*folders):
     files = [f for f in files if "__pycache__" not in f.parts]
     parents = sorted({f.parent for f in files})
     return [(f"{SHARE}/{p.as_posix()}", [str(f) for f in files if f.parent == p]) for p in parents]
+
+
+def build_interfaces(build_base):
+    """Have colcon build the interfaces, if it is colcon that installs this package and they are not there.
+
+    Raises:
+        SystemExit: They could not be built; the text holds the line to type.
+    """
+    prefix, source = Path(sys.prefix), Path(__file__).resolve().parent
+    merged = (prefix / ".colcon_install_layout").is_file()
+    workspace = prefix if merged else prefix.parent
+    if not (workspace / ".colcon_install_layout").is_file():
+        return  # pip, or a distribution's build: its packages are separate
+    ours = prefix if merged else workspace / INTERFACES
+    folder = Path(build_base).resolve().parent / INTERFACES
+    manifest = f"share/{INTERFACES}/package.xml"
+    known = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    if any((p / manifest).is_file() and not (p == ours and folder.is_dir()) for p in known):
+        return
+    print(f"building {INTERFACES}, which colcon does not look for below {source.name}", flush=True)
+    environment = dict(os.environ)
+    # What colcon put in front for this package alone would change where Python and CMake install.
+    private = ("prefix_override", "colcon_distutils_commands")
+    paths = environment.pop("PYTHONPATH", "").split(os.pathsep)
+    environment["PYTHONPATH"] = os.pathsep.join(p for p in paths if p and Path(p).name not in private)
+    command = ["colcon", "--log-base", str(folder / "log"), "build", *(["--merge-install"] if merged else [])]
+    command += ["--base-paths", str(source / "msg_defs"), "--event-handlers", "console_cohesion+"]
+    command += ["--build-base", str(folder), "--install-base", str(workspace)]
+    try:
+        status = subprocess.run(command, env=environment, cwd=source).returncode
+    except FileNotFoundError:
+        status = 127
+    if status:
+        sys.exit(
+            f"{INTERFACES} was not built (status {status}); see above, and name both packages:\n"
+            f"    colcon build --base-paths {source} {source / 'msg_defs'}"
+        )
+
+
+class Install(install):
+    """``colcon build``."""
+
+    def run(self):
+        """Install, then the interfaces."""
+        super().run()
+        build_interfaces(self.get_finalized_command("build").build_base)
+
+
+class Develop(develop):
+    """``colcon build --symlink-install``."""
+
+    def run(self):
+        """Link, then the interfaces."""
+        super().run()
+        build_interfaces(Path("build"))
 
 
 FLAGS = ["-O3", "-fno-math-errno", "-ffp-contract=off"]
@@ -70,6 +136,7 @@ setup(
         *shared_tree("config", "launch"),
     ],
     zip_safe=False,
+    cmdclass={"install": Install, "develop": Develop},
     install_requires=["numpy>=1.23", "scipy>=1.8", "PyYAML", "matplotlib>=3.5", "rich>=12", "Jinja2>=3"],
     extras_require={
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
@@ -89,6 +156,8 @@ setup(
             "identifier_node = calib_planner.ros.nodes.identifier:main",
             "simulator_node = calib_planner.ros.nodes.simulator:main",
             "campaign_node = calib_planner.ros.nodes.campaign:main",
+            "executor_node = calib_planner.ros.nodes.executor:main",
+            "page_node = calib_planner.ros.nodes.page:main",
         ],
     },
 )

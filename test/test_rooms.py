@@ -255,7 +255,7 @@ def test_the_walk_sees_modules_and_knows_ros() -> None:
     assert "rclpy" in inside and "calib_planner_msgs.srv" in inside
 
 
-@pytest.mark.parametrize("name", ["session.py"])
+@pytest.mark.parametrize("name", ["session.py", "execution.py"])
 def test_pure_parts_of_the_ros_room_are_pure(name: str) -> None:
     used = [i.module for i in imports(tree_of(PACKAGE / "ros" / name))]
     assert used and not [m for m in used if not m.startswith("calib_planner.ros") and is_ros(m)]

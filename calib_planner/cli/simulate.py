@@ -132,8 +132,8 @@ def _plan(robot: Robot, args: argparse.Namespace) -> tuple[FloatArray, IntArray 
 
 def _true_errors(robot: Robot, args: argparse.Namespace, seed: int) -> dict[str, float]:
     if args.true is None:
-        for option in ("length_error", "angle_error"):
-            check_number(f"--{option.replace('_', '-')}", getattr(args, option), low=0, high=1)
+        for name in ("length_error", "angle_error"):
+            check_number(f"--{name.replace('_', '-')}", getattr(args, name), low=0, high=1)
         return random_deviations(robot, seed, args.length_error, args.angle_error)
     errors: dict[str, float] = dict(args.true)
     for name, value in errors.items():

@@ -47,6 +47,7 @@ from calib_planner.planning.result import KEYS, KINDS, STATUS, Plan, PlannedTerm
 from calib_planner.planning.search.exchange import ChoiceProblem, choose
 from calib_planner.planning.sheet import NEVER, PlanSheet, person_factors, plan_sheet
 from calib_planner.planning.tour import (
+    BACK_OFF,
     DWELL,
     PEAK,
     SETTLE,
@@ -59,3 +60,4 @@ from calib_planner.planning.tour import (
     visit_times,
     visiting_order,
 )
+from calib_planner.planning.trajectory import Trajectory, joined, smooth, smooth_trajectory

@@ -10,7 +10,6 @@ for it to pass, and tries again every ``RETRY`` seconds.
 from __future__ import annotations
 
 import math
-import time
 import uuid
 from dataclasses import dataclass, replace
 
@@ -173,9 +172,9 @@ class Visit:
     anywhere: bool = False
     final: bool = False
 
-    def next(self, phase: str) -> None:
-        """Begin a phase."""
-        self.phase, self.since = phase, time.monotonic()
+    def next(self, phase: str, now: float) -> None:
+        """Begin a phase at ``now`` [s]."""
+        self.phase, self.since = phase, now
 
 
 class Measuring:
@@ -216,7 +215,7 @@ class Measuring:
     @property
     def waited(self) -> float:
         """How long ``waiting`` has lasted [s]."""
-        return time.monotonic() - self._waited_since if self.waiting else 0.0
+        return self._node.seconds - self._waited_since if self.waiting else 0.0
 
     def leave(self) -> None:
         """Measure nothing now: the robot stops."""
@@ -273,7 +272,7 @@ class Measuring:
         ended = self._execution.poll(self._settings.silence)
         visit = self.visit
         if visit is None or (visit.action.index, visit.action.repetition) != (action.index, action.repetition):
-            self.visit = visit = Visit(action, time.monotonic())
+            self.visit = visit = Visit(action, self._node.seconds)
             self._wait_for("")
         if visit.phase == "moving":
             if self._execution.begun:
@@ -285,7 +284,7 @@ class Measuring:
             self._tell(state, visit)
         elif visit.phase == "sending":
             self._send(visit)
-        elif visit.final or time.monotonic() - visit.since > self._settings.patience:
+        elif visit.final or self._node.seconds - visit.since > self._settings.patience:
             return self._not_measured(state, visit)
         return state
 
@@ -307,8 +306,8 @@ class Measuring:
         if self.taken == plan.plan_id:
             self._wait_for("")
             self.fit = plan if role == FIT else self.fit
-            visit.next("sending" if role == visit.action.role else "telling")
-        elif time.monotonic() - visit.since > RETRY:
+            visit.next("sending" if role == visit.action.role else "telling", self._node.seconds)
+        elif self._node.seconds - visit.since > RETRY:
             own = f"{self._node.get_fully_qualified_name()}/plan"
             self._wait_for(f"{self._settings.identifier} does not take the plan: is it there, plan_topic {own}?")
             if self._due():
@@ -328,13 +327,13 @@ class Measuring:
             part = plan.part(plan.numbers.index(visit.action.index))
             goal = plan_to_message(part, plan.plan_id, self._node.now, settings.frame_id)
             self._execution.send(ExecutePlan.Goal(plan=goal, dwell=duration_message(settings.dwell)))
-            visit.next("moving")
+            visit.next("moving", self._node.seconds)
 
     def _moved(self, state: CampaignState, visit: Visit, ended: Ended) -> CampaignState:
         index = visit.action.index
         if ended.how == "done":
             self._wait_for("")
-            visit.next("judging")
+            visit.next("judging", self._node.seconds)
         elif ended.how == "refused":
             return state.unreachable(index, ended.message or "refused by the robot")
         elif ended.how == "aborted":
@@ -342,7 +341,7 @@ class Measuring:
             return state.failed(index, ended.message or "the robot stopped")
         else:
             self._wait_for(ended.message or f"{ended.how} by the robot")
-            visit.next("sending")
+            visit.next("sending", self._node.seconds)
         return state
 
     def _not_measured(self, state: CampaignState, visit: Visit) -> CampaignState:
@@ -350,7 +349,7 @@ class Measuring:
         name = self._settings.identifier
         if not visit.reason and not self._node.count_publishers(f"{name}/measurements"):
             self._wait_for(f"{name} is not there")
-            visit.next("telling")
+            visit.next("telling", self._node.seconds)
             return state
         if visit.anywhere:
             self.visit, self._spoilt = None, visit.reason
@@ -368,13 +367,13 @@ class Measuring:
         """
         what = what or self._spoilt
         if what and not self.waiting:
-            self._waited_since = self._tried = time.monotonic()
+            self._waited_since = self._tried = self._node.seconds
             self._node.get_logger().warning(f"waiting: {what}")
         self.waiting = what
 
     def _due(self) -> bool:
         """Whether it is time for another attempt."""
-        now = time.monotonic()
+        now = self._node.seconds
         due = now - self._tried > RETRY
         self._tried = now if due else self._tried
         return due

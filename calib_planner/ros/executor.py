@@ -3,13 +3,13 @@
 ``check_executable`` serves the simulated robot and the adapter of a real one alike.
 
 A goal of ``PlanExecution`` ends with the robot's result, or as *lost*: nothing was heard of it (no answer, no
-feedback) for ``silence`` seconds. A lost goal may be running all the same; it is cancelled by the id that
-``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called in the executor's thread.
+feedback) for ``silence`` seconds, as the node counts them. A lost goal may be running all the same; it is
+cancelled by the id that ``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called in
+the executor's thread.
 """
 
 from __future__ import annotations
 
-import time
 import uuid
 from dataclasses import dataclass
 from typing import Any
@@ -69,7 +69,7 @@ class PlanExecution:
         self._client = ActionClient(node, ExecutePlan, action)
         node.undo_with(self._client.destroy)
         self._canceller = node.create_client(CancelGoal, f"{action}/_action/cancel_goal")
-        self.action = action
+        self._node, self.action = node, action
         self._goal: UUID | None = None
         self._ended: Ended | None = None
         self._heard = 0.0
@@ -94,7 +94,7 @@ class PlanExecution:
         """Begin a goal; the one before must have ended."""
         name = UUID(uuid=list(uuid.uuid4().bytes))
         self._goal, self._ended, self._begun, self._cancelling = name, None, False, False
-        self._heard = time.monotonic()
+        self._heard = self._node.seconds
         sent = self._client.send_goal_async(goal, lambda _: self._alive(name, begun=True), goal_uuid=name)
         sent.add_done_callback(lambda future: self._answered(name, future))
 
@@ -103,7 +103,7 @@ class PlanExecution:
         if self._goal is None or self._cancelling:
             return
         self._cancelling = True
-        self._heard = time.monotonic()
+        self._heard = self._node.seconds
         self._cancel(self._goal)
 
     def poll(self, silence: float) -> Ended | None:
@@ -112,7 +112,7 @@ class PlanExecution:
         Args:
             silence: Longest time without an answer or feedback [s].
         """
-        if self._goal is not None and self._ended is None and time.monotonic() - self._heard > silence:
+        if self._goal is not None and self._ended is None and self._node.seconds - self._heard > silence:
             self._cancel(self._goal)
             self._ended = Ended("lost", f"nothing heard from {self.action} for {silence:g} s")
         ended = self._ended
@@ -122,7 +122,7 @@ class PlanExecution:
 
     def _alive(self, name: UUID, begun: bool = False) -> None:
         if name is self._goal:
-            self._heard = time.monotonic()
+            self._heard = self._node.seconds
             self._begun |= begun
 
     def _answered(self, name: UUID, future: Any) -> None:

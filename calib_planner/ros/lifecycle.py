@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import functools
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
+from calib_planner.acquisition import NANO
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.ros.parameters import QOS, REQUESTS, NodeParameters, overridable, own, parameter
 from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
@@ -43,6 +45,10 @@ from calib_planner.ros.rclpy_ext.lifecycle import TidyLifecycleNode, given_param
 from calib_planner.units import cut
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+JUMP = 3600.0
+"""Simulated time goes on by less between two looks; more is another bag, or the clock's first message [s]."""
+LOOK = 0.01
+"""Real time between two looks at a simulated clock [s]."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,25 @@ class LifecycleParameters:
     """The parameters that every node has; those of a node inherit from it."""
 
     autostart: bool = parameter(True, "go to active without a lifecycle manager", read_only=True)
+
+
+class Stopwatch:
+    """Seconds that have passed since it was made, as far as anybody has looked.
+
+    Simulated time may jump, back when a bag begins again; what it jumps by has not passed.
+    """
+
+    def __init__(self) -> None:
+        self._turn, self._before, self._passed = threading.Lock(), (False, 0.0), 0.0
+
+    def at(self, now: float, simulated: bool) -> float:
+        """Seconds passed [s] at ``now`` [s], by a simulated clock or by a real one that never jumps."""
+        with self._turn:
+            before, self._before = self._before, (simulated, now)
+            step = now - before[1] if before[0] == simulated else 0.0
+            if not simulated or 0.0 <= step < JUMP:
+                self._passed += step
+            return self._passed
 
 
 P = TypeVar("P", bound=LifecycleParameters)
@@ -79,6 +104,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         self, name: str, defaults: P, context: Context | None = None, overrides: Sequence[Parameter] = ()
     ) -> None:
         self._made: list[ExitStack] = []  # before rclpy makes its own services, by our methods
+        self._stopwatch = Stopwatch()
         self.failure, self.autostarted, self._ending = "", False, False
         super().__init__(name, context=context, parameter_overrides=list(overrides))
         self.guard_change_state(self._safe_service)
@@ -127,6 +153,21 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     def now(self) -> int:
         """The node's time [ns]."""
         return int(self.get_clock().now().nanoseconds)
+
+    @property
+    def seconds(self) -> float:
+        """Time that only goes on [s], to tell how long something lasts and when it has lasted too long.
+
+        With ``use_sim_time`` it is simulated time: what waits for others waits as long as they do.
+        """
+        simulated = self.get_clock().ros_time_is_active
+        return self._stopwatch.at(self.now / NANO if simulated else time.monotonic(), simulated)
+
+    def rest(self, seconds: float, end: threading.Event) -> None:
+        """In a thread of its own: wait for ``seconds`` more, as the property of that name counts, or ``end``."""
+        until = self.seconds + seconds
+        while not end.is_set() and (left := until - self.seconds) > 0.0:
+            end.wait(min(left, LOOK) if self.get_clock().ros_time_is_active else left)
 
     def close(self) -> bool:
         """End everything when the process ends; returns whether nothing is under way any more.
@@ -260,7 +301,10 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         return self._destroyed_later(self.destroy_timer, made)
 
     def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Timer:
-        """A timer of real time, with ``period`` [s]; simulated time may stand still."""
+        """A timer of real time, with ``period`` [s], to look at what has come; simulated time may stand still.
+
+        How long something may last is told by ``seconds``.
+        """
         return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def create_client(self, *args: Any, **others: Any) -> Any:

@@ -14,17 +14,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calib_planner.acquisition import NANO
 from calib_planner.arrays import FloatArray, IntArray, frozen
-from calib_planner.planning import PEAK, backed_off, near
-
-
-def smooth(tau: ArrayLike) -> FloatArray:
-    """s(τ) of times τ (…,) as shares of a move; at rest before and after it."""
-    x = np.clip(tau, 0.0, 1.0)
-    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+from calib_planner.planning import PEAK, backed_off, near, smooth
 
 
 @dataclass(frozen=True, eq=False)

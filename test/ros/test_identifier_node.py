@@ -12,6 +12,7 @@ from builtin_interfaces.msg import Time
 from calib_planner_msgs.msg import Measurement, Verdict
 from calib_planner_msgs.srv import UndoMeasurement
 from diagnostic_msgs.msg import DiagnosticArray
+from poses import poses
 from robots import plan_of, random_configurations
 from sensor_msgs.msg import JointState
 from shift import NAME, Estimate, Shift, change
@@ -90,8 +91,8 @@ def test_saving_without_a_folder_says_what_to_set(bench: Bench, robot: Robot) ->
 def test_nonsense_on_every_topic_does_no_harm(shift: Shift, planned: Plan) -> None:
     good = plan_to_message(planned, "bad", 0, "base")
     for field, value in (
-        ("configurations", [1.0]),
-        ("configurations", [float("nan")] * 8),
+        ("configurations", poses([1.0])),
+        ("configurations", poses([float("nan")] * 2) * 4),
         ("robot", "other"),
         ("parameters", ["none"]),
         ("repetitions", []),

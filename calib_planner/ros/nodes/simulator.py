@@ -178,7 +178,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             feedback.phase = kind.MEASURING if phase.measuring else kind.MOVING
             feedback.elapsed = duration_message(seconds)
             goal.publish_feedback(feedback)
-            self._work.closing.wait(FEEDBACK_PERIOD)
+            self.rest(FEEDBACK_PERIOD, self._work.closing)
 
 
 def make_world(chosen: SimulatorParameters) -> World:
