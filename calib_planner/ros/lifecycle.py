@@ -32,6 +32,7 @@ from rclpy.context import Context
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -49,6 +50,10 @@ JUMP = 3600.0
 """Simulated time goes on by less between two looks; more is another bag, or the clock's first message [s]."""
 LOOK = 0.01
 """Real time between two looks at a simulated clock [s]."""
+
+
+OWN = "calib_planner_msgs"
+"""Package of the messages that are this project's own."""
 
 
 @dataclass(frozen=True)
@@ -265,10 +270,16 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], qos_profile: Any, **others: Any
     ) -> Subscription:
-        """As rclpy's, with QoS overrides; an exception in the callback is logged."""
+        """As rclpy's, with QoS overrides; an exception in the callback is logged.
+
+        Messages of this package are taken as bytes: those of another version, as an old bag plays them, have the
+        same name, and rclpy drops them without a word that a callback hears.
+        """
         if not self._made:
             return super().create_subscription(msg_type, topic, callback, qos_profile, **others)
         others.setdefault("qos_overriding_options", overridable())
+        if msg_type.__module__.startswith(f"{OWN}."):
+            callback, others["raw"] = _decoded(msg_type, topic, callback), True
         made = super().create_subscription(msg_type, topic, self._safe(callback), own(qos_profile), **others)
         return self._destroyed_later(self.destroy_subscription, made)
 
@@ -388,6 +399,21 @@ class OneAtATime:
     def ended(self) -> bool:
         """Whether nothing is under way."""
         return not self._busy.locked()
+
+
+def _decoded(kind: Any, topic: str, callback: Callable[..., None]) -> Callable[[bytes], None]:
+    """What makes a message of ``kind`` out of bytes, for ``callback``; it refuses those of another version."""
+
+    def decoded(data: bytes) -> None:
+        try:
+            message = deserialize_message(data, kind)
+        except Exception:
+            name = f"{OWN}/{kind.__name__}"
+            advice = "leave this topic out when a bag from before 1.0 is played; see docs/migration.md"
+            raise InputError(topic, f"another version of {name}", f"{name} as it is now", advice) from None
+        callback(message)
+
+    return decoded
 
 
 def failed(kind: Any, reason: str) -> Any:
