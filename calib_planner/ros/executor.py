@@ -4,8 +4,8 @@
 
 A goal of ``PlanExecution`` ends with the robot's result, or as *lost*: nothing was heard of it (no answer, no
 feedback) for ``silence`` seconds, as the node counts them. A lost goal may be running all the same; it is
-cancelled by the id that ``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called in
-the executor's thread.
+cancelled by the id that ``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called
+in the executor's thread.
 """
 
 from __future__ import annotations
