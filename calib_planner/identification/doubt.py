@@ -111,6 +111,13 @@ def shifted_run(solution: Solution) -> IntArray | None:
 
 def squares_of_points(solution: Solution, doubt: FloatArray) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
     """(N, targets) d²; which points were measured; mean variance of a coordinate in R_i without D [m²]."""
+    known = solution.__dict__.get("squares_of_points")
+    if known is None or not np.array_equal(known[0], doubt):
+        known = solution.__dict__["squares_of_points"] = (doubt, _squares_of_points(solution, doubt))
+    return known[1]
+
+
+def _squares_of_points(solution: Solution, doubt: FloatArray) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
     left = left_out(solution)
     n, targets, _ = left.residuals.shape
     every = np.arange(targets)

@@ -15,6 +15,11 @@ The paper's model has no scales and no terms to choose: what is left are its ste
 An estimate of most of the same measurements is a *start* (``fit_error_model``): its scales and terms are kept,
 and the few visits that came or went are brought in by (4), doubts included. The full fit is made all the same
 where that would not be good enough (``update_error_model``). What a full fit says depends on the data alone.
+
+All visits of an update are linearised at the same β, that of the last relinearisation. Where base and first joint
+can hardly be told apart, the columns say so only if they are taken at one place: columns from two places disagree
+on which combination nothing tells, and would tell it, which is not true (of the first-estimates Jacobian of
+Huang, Mourikis & Roumeliotis 2010). Estimates then wander along what nobody sees, visit by visit.
 """
 
 from __future__ import annotations
@@ -44,6 +49,7 @@ from calib_planner.identification.likelihood import (
     LinearProblem,
     Solution,
     exchange,
+    joined,
     maximise,
     scale_covariance,
     solve,
@@ -146,6 +152,7 @@ class Origin:
         robust: Whether impossible points lose weight; default: with every model but the paper's.
         shifted: (N, targets) D of the points of a run of visits that is shifted [m²].
         coefficients: (coefficients,) β of the fit.
+        linearised: (coefficients,) β at which the columns of its linear problem were taken.
         scales: Names of the scales that were estimated, and the covariance of their logarithms.
         visits: How many visits the last full fit had.
         surprise: Sum of the squared left-out residuals over its expectation at the last full fit.
@@ -156,6 +163,7 @@ class Origin:
     robust: bool
     shifted: FloatArray
     coefficients: FloatArray
+    linearised: FloatArray
     scales: tuple[tuple[str, ...], FloatArray]
     visits: int
     surprise: float
@@ -177,6 +185,7 @@ class _Work:
         robot: With base and targets about where they are; β are deviations from it.
         data: The visits that take part.
         state: Where it is linearised.
+        at: (coefficients,) β where it was linearised last.
         rounds: Relinearisations made.
         converged: Whether the predictions stand still after the last one.
         moved: How far they moved in the last one, as a multiple of what stands still.
@@ -186,6 +195,7 @@ class _Work:
     def __init__(self, robot: Robot, data: Measurements, model: ErrorModel) -> None:
         self.robot, self.data = robot, data
         self.state = _State(np.zeros(len(model.variances(robot))), model, np.zeros(data.seen.shape))
+        self.at = self.state.coefficients
         self.rounds, self.converged, self.moved = 0, False, 0.0
         self.shifted = np.zeros(data.seen.shape)
 
@@ -197,6 +207,7 @@ class _Work:
     def linearised(self) -> LinearProblem:
         """(M1) at the state."""
         data, state = self.data, self.state
+        self.at = state.coefficients
         poses = self._poses(state.coefficients)
         seen = np.repeat(data.seen, 3, axis=1).astype(float)
         columns = state.model.columns(poses) * seen[:, :, None]
@@ -241,8 +252,7 @@ class _Work:
 
     def _cost(self, problem: LinearProblem, coefficients: FloatArray) -> float:
         """What least squares minimises, through the kinematics and not its linearisation."""
-        apart = np.where(self.data.seen[:, :, None], self.data.p - self._poses(coefficients).points, 0.0)
-        flat = apart.reshape(len(apart), -1, 1)
+        flat = self.apart(coefficients)[:, :, None]
         prior = np.sum(problem.standard(coefficients[problem.random] - problem.means) ** 2)
         return float(np.sum(flat * np.linalg.solve(problem.covariance, flat)) + prior)
 
@@ -257,6 +267,11 @@ class _Work:
         poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
         return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
 
+    def apart(self, coefficients: FloatArray) -> FloatArray:
+        """(N, m) measured − predicted at β (coefficients,) [m]; 0 where not measured."""
+        difference = self.data.p - self._poses(coefficients).points
+        return np.where(self.data.seen[:, :, None], difference, 0.0).reshape(len(difference), -1)
+
     def bent(self, solution: Solution) -> FloatArray | None:
         """(N, m) by how much the kinematics leave other residuals at the state than the linear problem does [m].
 
@@ -264,12 +279,10 @@ class _Work:
         """
         problem = solution.problem
         straight = (problem.covariance @ solution.weighted[:, :, None])[:, :, 0] * problem.seen
-        apart = np.where(
-            self.data.seen[:, :, None], self.data.p - self._poses(self.state.coefficients).points, 0.0
-        )
+        apart = self.apart(self.state.coefficients)
         usual = problem.covariance - problem.parts.get("doubt", 0.0)
         allowed = BENDS * np.sqrt(np.diagonal(usual, axis1=1, axis2=2)) + LEAST
-        difference = apart.reshape(straight.shape) - straight
+        difference = apart - straight
         return difference if (np.abs(difference) > allowed).any() else None
 
     def start(self, model: ErrorModel) -> None:
@@ -471,6 +484,7 @@ def _estimate(
             robust,
             work.shifted,
             work.state.coefficients,
+            work.at,
             scales,
             len(data),
             _surprise(left),
@@ -594,8 +608,7 @@ def _updated(
     if len(data) > GROWN * origin.visits or stays.sum() < origin.visits / GROWN:
         return None
     work = _Work(placed, data, old.model)
-    flat = old.flat
-    reference = origin.coefficients[flat] - start.solution.coefficients[flat]
+    flat, reference = old.flat, origin.linearised[old.flat]
     doubt = np.zeros(data.seen.shape)
     doubt[stays] = start.doubt[rows[stays]]
     work.shifted[stays] = origin.shifted[rows[stays]]
@@ -608,11 +621,12 @@ def _updated(
     work.state = _State(origin.coefficients, old.model, doubt)
     fresh = np.flatnonzero(~stays)
     new = _Work(placed, data.select(fresh), old.model)
-    new.state = replace(work.state, doubt=np.zeros((len(fresh), doubt.shape[1])))
+    new.state = _State(origin.linearised, old.model, np.zeros((len(fresh), doubt.shape[1])))
     more = new.linearised() if len(fresh) else None
     if more is not None:
-        away = origin.coefficients[flat] - reference
-        more = replace(more, y=more.y + more.columns[:, :, flat] @ away)
+        # The residuals of the newest estimate, the columns of the first: see the top of the file.
+        turn = new.apart(origin.coefficients) - new.apart(origin.linearised)
+        more = replace(more, y=more.y + turn + more.columns @ (origin.coefficients - origin.linearised))
     problem = _joined(old, more, rows, doubt)
     solution = exchange(updatable(start.solution), problem, rows)
     for _ in range(MOST_DOUBTS if robust else 0):
@@ -624,6 +638,7 @@ def _updated(
         problem.__dict__["flat"], problem.__dict__["random"] = old.flat, old.random
         solution = exchange(solution, problem, np.arange(len(data)))
     final: Solution | None = None
+    linearised = origin.linearised
     for _ in range(CHORDS):
         coefficients = solution.coefficients.copy()
         coefficients[flat] += reference
@@ -637,6 +652,7 @@ def _updated(
         solution = with_points_moved(solution, bent)
     if final is None:
         final = work.settle(4, 0)
+        linearised = work.at
     left = left_out(final, work.groups)
     surprise = _surprise(left)
     if not origin.surprise / OFF < surprise < origin.surprise * OFF:
@@ -649,7 +665,9 @@ def _updated(
         solution=final,
         rounds=work.rounds,
         converged=work.converged,
-        origin=replace(origin, data=data, shifted=work.shifted, coefficients=work.state.coefficients),
+        origin=replace(
+            origin, data=data, shifted=work.shifted, coefficients=work.state.coefficients, linearised=linearised
+        ),
     )
 
 
@@ -684,14 +702,10 @@ def _common(old: Measurements, new: Measurements) -> IntArray:
 
 def _joined(old: LinearProblem, new: LinearProblem | None, rows: IntArray, doubt: FloatArray) -> LinearProblem:
     """The visits ``rows`` of the old problem, and where these are −1 the new one's, with doubts D."""
-    stays = rows >= 0
+    nothing = np.zeros(0)
 
     def join(one: FloatArray, other: FloatArray | None) -> FloatArray:
-        result = np.empty((len(rows), *one.shape[1:]))
-        result[stays] = one[rows[stays]]
-        if other is not None:
-            result[~stays] = other
-        return result
+        return joined(one, nothing.reshape(0, *one.shape[1:]) if other is None else other, rows)
 
     parts = {
         n: join(p, None if new is None else new.parts[n])

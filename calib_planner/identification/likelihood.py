@@ -39,6 +39,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import dgemm, dsyrk
 from scipy.linalg.lapack import dpotri, dtrtri
 
 from calib_planner.arrays import FloatArray, IntArray
@@ -174,6 +175,23 @@ class LinearProblem:
         result[self.random] = self.spread(reduced[rank:])
         return result
 
+    def expand_both(self, reduced: FloatArray) -> FloatArray:
+        """T C Tᵀ (coefficients, coefficients) of C = ``reduced`` (rank + K, rank + K), with β = T (γ, Λ^-½ u).
+
+        T is diagonal but for the parameters, which are the first of the coefficients.
+        """
+        first = len(self.robot.parameter_names)
+        own = len(reduced) - (self.columns.shape[2] - first)
+        head = self.expand(np.eye(len(reduced))[:, :own])[:first]
+        root = self.root[len(self.root) - (len(reduced) - own) :]
+        result = np.empty((self.columns.shape[2],) * 2)
+        np.multiply(reduced[own:, own:], root, out=result[first:, first:])
+        result[first:, first:] *= root[:, None]
+        result[:first, first:] = head @ (reduced[:own, own:] * root)
+        result[first:, :first] = result[:first, first:].T
+        result[:first, :first] = head @ reduced[:own, :own] @ head.T
+        return result
+
     @cached_property
     def covariance(self) -> FloatArray:
         """(N, m, m) R_i."""
@@ -237,8 +255,7 @@ class Solution:
 
     def posterior(self) -> FloatArray:
         """(coefficients, coefficients) C of β given the data, (M2); zero in directions no point shows."""
-        half = self.problem.expand(self._reduced_covariance())
-        return self.problem.expand(half.T)
+        return self.problem.expand_both(self._reduced_covariance())
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +348,8 @@ class UpdatedSolution(Solution):
     """By (3), kept so that (4) can change it.
 
     ``rows`` (N·m, rank + K) is W, ``precision`` (N, m, m) R_i⁻¹, ``inverse`` (rank + K, rank + K) A⁻¹,
-    ``log_determinant`` log|A| and ``spread`` (N, m, m) W_i A⁻¹ W_iᵀ.
+    ``log_determinant`` log|A|, ``spread`` (N, m, m) W_i A⁻¹ W_iᵀ, ``reduced`` (rank + K,) γ̂ and Λ^-½ û, and
+    ``fitted`` (N, m) W times these [m].
     """
 
     rows: FloatArray
@@ -339,6 +357,8 @@ class UpdatedSolution(Solution):
     inverse: FloatArray
     log_determinant: float
     spread: FloatArray
+    reduced: FloatArray
+    fitted: FloatArray
 
     @cached_property
     def blocks(self) -> FloatArray:
@@ -358,7 +378,8 @@ class UpdatedSolution(Solution):
         return np.asarray((self.precision @ vectors.reshape(n, m, -1)).reshape(n * m, -1))
 
     def _reduced(self, vectors: FloatArray) -> FloatArray:
-        return np.asarray(self.inverse @ (self.rows.T @ self._times(vectors)))
+        few = np.ascontiguousarray(self._times(vectors).T)
+        return np.asarray(((few @ self.rows) @ self.inverse).T)
 
     def _reduced_covariance(self) -> FloatArray:
         return self.inverse
@@ -440,18 +461,27 @@ def updatable(solution: Solution) -> UpdatedSolution:
     problem = solution.problem
     n, m = problem.y.shape
     rows = np.hstack([problem.flat_columns, problem.scaled_columns])
-    whitening = np.linalg.inv(np.linalg.cholesky(problem.covariance))
-    precision = np.asarray(whitening.transpose(0, 2, 1) @ whitening, np.float64)
-    white = (whitening @ rows.reshape(n, m, -1)).reshape(n * m, -1)
-    normal = white.T @ white
-    rank = problem.flat_columns.shape[1]
-    normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    factor = np.linalg.cholesky(normal * np.outer(scale, scale))
-    inverse = _inverse_of(factor) * np.outer(scale, scale)
-    spread = (rows @ inverse).reshape(n, m, -1) @ rows.reshape(n, m, -1).transpose(0, 2, 1)
-    logarithm = 2.0 * float((np.log(np.diag(factor)) - np.log(scale)).sum())
-    return _finished(problem, rows, precision, inverse, logarithm, spread)
+    if isinstance(solution, CoefficientSolution):
+        half = solution.half
+        precision = np.asarray(solution.inverse.transpose(0, 2, 1) @ solution.inverse, np.float64)
+        inverse = _mirrored(dsyrk(1.0, half.T, trans=1, lower=1))
+        spread = problem.covariance - problem.covariance @ solution.blocks @ problem.covariance
+        logarithm = -2.0 * float(np.log(np.diag(half)).sum())
+    else:
+        whitening = np.linalg.inv(np.linalg.cholesky(problem.covariance))
+        precision = np.asarray(whitening.transpose(0, 2, 1) @ whitening, np.float64)
+        white = (whitening @ rows.reshape(n, m, -1)).reshape(n * m, -1)
+        normal = white.T @ white
+        rank = problem.flat_columns.shape[1]
+        normal[np.diag_indices(len(normal))] += np.repeat([0.0, 1.0], [rank, len(normal) - rank])
+        scale = 1.0 / np.sqrt(np.diag(normal))
+        factor = np.linalg.cholesky(normal * np.outer(scale, scale))
+        inverse = _inverse_of(factor) * np.outer(scale, scale)
+        spread = (rows @ inverse).reshape(n, m, -1) @ rows.reshape(n, m, -1).transpose(0, 2, 1)
+        logarithm = 2.0 * float((np.log(np.diag(factor)) - np.log(scale)).sum())
+    reduced = inverse @ (rows.T @ (precision @ problem.y[:, :, None]).ravel())
+    fitted = (rows @ reduced).reshape(n, m)
+    return _finished(problem, rows, precision, inverse, logarithm, spread, reduced, fitted)
 
 
 def exchange(solution: UpdatedSolution, problem: LinearProblem, old: IntArray) -> UpdatedSolution:
@@ -472,11 +502,9 @@ def exchange(solution: UpdatedSolution, problem: LinearProblem, old: IntArray) -
         rows = solution.rows
     else:
         new = problem.columns[~stays]
-        joined = np.empty((n, m, solution.rows.shape[1]))
-        joined[stays] = solution.rows.reshape(len(before.y), m, -1)[old[stays]]
         flat = new[:, :, problem.flat] @ before.basis
-        joined[~stays] = np.concatenate([flat, problem.scaled(new[:, :, problem.random])], axis=2)
-        rows = joined.reshape(n * m, -1)
+        fresh = np.concatenate([flat, problem.scaled(new[:, :, problem.random])], axis=2)
+        rows = joined(solution.rows.reshape(len(before.y), m, -1), fresh, old).reshape(n * m, -1)
     problem.__dict__["basis"] = before.basis
     problem.__dict__["flat_columns"] = rows[:, : before.basis.shape[1]]
     problem.__dict__["scaled_columns"] = rows[:, before.basis.shape[1] :]
@@ -491,23 +519,31 @@ def exchange(solution: UpdatedSolution, problem: LinearProblem, old: IntArray) -
     theirs = np.concatenate(
         [rows.reshape(n, m, -1)[changed], solution.rows.reshape(len(before.y), m, -1)[gone]]
     ).reshape(len(blocks) * m, rows.shape[1])
-    carried = solution.inverse @ theirs.T
+    carried = np.ascontiguousarray((theirs @ solution.inverse).T)
     middle = np.eye(len(theirs)) + _blocks_times(blocks, theirs @ carried)
     shares = np.linalg.eigvals(middle).real  # of the information in each direction that is left
     if not shares.min(initial=1.0) > ROUNDED_OFF:
         raise np.linalg.LinAlgError("a visit that went had been the only one to tell a direction")
     inner = np.linalg.solve(middle, _blocks_times(blocks, np.eye(len(theirs))))
     inner = 0.5 * (inner + inner.T)
-    inverse = solution.inverse - carried @ inner @ carried.T
-    spread = np.zeros((n, m, m))
+    inverse = solution.inverse.copy()
+    dgemm(-1.0, (carried @ inner).T, carried.T, 1.0, inverse.T, trans_a=1, overwrite_c=1)
+    spread, fitted = np.zeros((n, m, m)), np.zeros((n, m))
     spread[stays] = solution.spread[old[stays]]
-    moved = (rows @ carried).reshape(n, m, -1)
+    moved = np.asarray(dgemm(1.0, rows.T, carried.T, trans_a=1, trans_b=1)).reshape(n, m, -1)
     spread -= moved @ inner @ moved.transpose(0, 2, 1)
     own = rows.reshape(n, m, -1)[~stays]
     spread[~stays] = (own @ inverse) @ own.transpose(0, 2, 1)
-    return _finished(
-        problem, rows, precision, inverse, solution.log_determinant + float(np.log(shares).sum()), spread
-    )
+    # Of R⁻¹ y what came and went: A⁻¹Wᵀ of it is ``carried`` times it, and (4) makes A'⁻¹ of A⁻¹.
+    measured = np.concatenate([problem.y[changed], before.y[gone]])
+    came = _blocks_times(blocks, measured.reshape(-1, 1))[:, 0]
+    step = came - inner @ (theirs @ (solution.reduced + carried @ came))
+    reduced = solution.reduced + carried @ step
+    fitted[stays] = solution.fitted[old[stays]]
+    fitted[stays] += (moved @ step)[stays]
+    fitted[~stays] = own @ reduced
+    logarithm = solution.log_determinant + float(np.log(shares).sum())
+    return _finished(problem, rows, precision, inverse, logarithm, spread, reduced, fitted)
 
 
 def with_points_moved(solution: UpdatedSolution, change: FloatArray) -> UpdatedSolution:
@@ -516,14 +552,30 @@ def with_points_moved(solution: UpdatedSolution, change: FloatArray) -> UpdatedS
     problem = replace(before, y=before.y + change)
     for name in ("flat", "random", "root", "ratios", "basis", "flat_columns", "scaled_columns", "covariance"):
         problem.__dict__[name] = getattr(before, name)
-    return _finished(
+    step = solution.inverse @ (solution.rows.T @ (solution.precision @ change[:, :, None]).ravel())
+    moved = _finished(
         problem,
         solution.rows,
         solution.precision,
         solution.inverse,
         solution.log_determinant,
         solution.spread,
+        solution.reduced + step,
+        solution.fitted + (solution.rows @ step).reshape(change.shape),
     )
+    if "blocks" in solution.__dict__:
+        moved.__dict__["blocks"] = solution.blocks
+    return moved
+
+
+def joined(before: FloatArray, new: FloatArray, old: IntArray) -> FloatArray:
+    """(N, …) the rows ``old`` of ``before``, and where these are −1 those of ``new``, one after the other."""
+    stays = old >= 0
+    if np.array_equal(old[: len(before)], np.arange(len(before))) and not stays[len(before) :].any():
+        return np.concatenate([before, new])  # the usual: as visits come
+    result = np.empty((len(old), *before.shape[1:]))
+    result[stays], result[~stays] = before[old[stays]], new
+    return result
 
 
 def _rows(visits: IntArray, size: int) -> IntArray:
@@ -544,33 +596,38 @@ def _finished(
     inverse: FloatArray,
     logarithm: float,
     spread: FloatArray,
+    reduced: FloatArray,
+    fitted: FloatArray,
 ) -> UpdatedSolution:
     """The solution from A⁻¹ ``inverse``, log|A| ``logarithm`` and the other parts of ``UpdatedSolution``."""
-    (n, m), rank = problem.y.shape, problem.basis.shape[1]
-    right = (precision @ problem.y[:, :, None])[:, :, 0]
-    solution = inverse @ (rows.T @ right.ravel())
-    rest = problem.y - (rows @ solution).reshape(n, m)
-    weighted = (precision @ rest[:, :, None])[:, :, 0]
+    rank = problem.basis.shape[1]
+    weighted = (precision @ (problem.y - fitted)[:, :, None])[:, :, 0]
     value = logarithm - float(np.linalg.slogdet(precision)[1].sum()) + float(np.sum(problem.y * weighted))
     return UpdatedSolution(
         problem,
         value,
-        problem.expand(solution),
+        problem.expand(reduced),
         weighted,
         1.0 - np.diag(inverse)[rank:],
-        solution[rank:],
+        reduced[rank:],
         rows,
         precision,
         inverse,
         logarithm,
         spread,
+        reduced,
+        fitted,
     )
 
 
 def _inverse_of(factor: FloatArray) -> FloatArray:
     """Of L Lᵀ, from the lower triangle L."""
-    half, _ = dpotri(factor, lower=1)
-    return np.asarray(np.tril(half) + np.tril(half, -1).T)
+    return _mirrored(dpotri(factor, lower=1)[0])
+
+
+def _mirrored(lower: FloatArray) -> FloatArray:
+    """The symmetric matrix of which ``lower`` holds the lower triangle."""
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
@@ -616,8 +673,8 @@ def derivatives(solution: Solution, names: tuple[str, ...]) -> tuple[FloatArray,
 def _pushes(solution: Solution, names: tuple[str, ...]) -> FloatArray:
     """(N·m, scales) ∂V P y by the logarithm of each scale."""
     problem, nothing = solution.problem, np.zeros(len(solution.pulls))
-    ratios = np.stack([problem.ratios.get(n, nothing) for n in names], axis=1)
-    pushes = problem.scaled_columns @ (ratios * solution.pulls[:, None])
+    ratios = np.stack([problem.ratios.get(n, nothing) for n in names])
+    pushes = np.ascontiguousarray(((ratios * solution.pulls) @ problem.scaled_columns.T).T)
     for at, name in enumerate(names):
         if name in problem.parts:
             pushes[:, at] += 2.0 * (problem.parts[name] @ solution.weighted[:, :, None]).ravel()
@@ -643,7 +700,7 @@ def with_uncertain_scales(solution: Solution, scales: tuple[tuple[str, ...], Flo
         if name in problem.ratios:
             direct[problem.random, at] = problem.ratios[name] * solution.coefficients[problem.random]
     gradient = direct - solution.coefficients_of(_pushes(solution, names))
-    result += gradient @ covariance @ gradient.T
+    dgemm(1.0, (gradient @ covariance).T, gradient.T, 1.0, result.T, trans_a=1, overwrite_c=1)
     return result
 
 

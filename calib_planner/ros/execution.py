@@ -7,10 +7,10 @@
 
 *READYING* is before every move: joint states are fresh, the robot stands still, the controller is there, the
 tracker holds its targets. Where a planner of ways is used, the way is planned then (*PLANNING*); step by step, a
-person confirms it (*CONFIRMING*). *MOVING* sends one trajectory and follows it until the joint states say that the
-robot stands still at its end: the controller's word alone does not count. *MEASURING* is the standstill, *LEAVING*
-waits until the controller, too, says that its move has ended. Whatever ends an execution early cancels the
-controller's goal first (*STOPPING*) and ends when the robot is seen to stand, or says loudly that it is not.
+person confirms it (*CONFIRMING*). *MOVING* sends one trajectory and follows it until the joint states say that
+the robot stands still at its end: the controller's word alone does not count. *MEASURING* is the standstill,
+*LEAVING* waits until the controller, too, says that its move has ended. Whatever ends an execution early cancels
+the controller's goal first (*STOPPING*) and ends when the robot is seen to stand, or says loudly that it is not.
 
 *Following.* The controller takes the trajectory some time after it was sent, at the latest ``start_delay`` after
 it was accepted. So at the time t of a joint state, every joint has to be where the trajectory has it at some time
@@ -36,6 +36,7 @@ from calib_planner.planning import Pace, Plan, Trajectory, joined, smooth_trajec
 from calib_planner.robot import Robot
 from calib_planner.units import counted, cut
 
+REFUSED = "the controller refused the move"
 SET_BACK = 1.0
 """A clock that goes back by more than this was set, or a simulation began again [s]."""
 
@@ -514,7 +515,7 @@ def _taken(state: Execution, event: Event) -> tuple[Execution, Actions]:
         if event.accepted:
             state = replace(state, goal=replace(goal, accepted=state.now), moved=True)
             return state, (Cancel(goal.number),) if state.ending else ()
-        return replace(state, goal=replace(goal, over=state.now, failure="it refused the goal")), ()
+        return replace(state, goal=replace(goal, over=state.now, failure=REFUSED)), ()
     if isinstance(event, Finished) and goal is not None and event.number == goal.number and goal.over is None:
         failure = "" if event.succeeded else cut(event.reason, 300) or "it did not say why"
         return replace(state, goal=replace(goal, over=state.now, failure=failure), moved=True), ()
@@ -650,9 +651,10 @@ def _trouble(state: Execution) -> tuple[Execution, Actions] | None:
     if dark:
         return _end(state, "BEAM_LOST", _beam_lost(dark))
     if goal.failure:
-        status = "ABORTED" if state.moved else "NOT_READY"
-        advice = "" if state.moved else "; is the controller active, and for these joints?"
-        return _end(state, status, f"the controller did not end the move: {goal.failure}{advice}", place=True)
+        if goal.accepted is None:
+            status = "ABORTED" if state.moved else "NOT_READY"
+            return _end(state, status, f"{goal.failure}: is it active, and for these joints?", place=True)
+        return _end(state, "ABORTED", f"the controller gave the move up: {goal.failure}", place=True)
     return None
 
 
@@ -719,7 +721,7 @@ def _leaving(state: Execution) -> tuple[Execution, Actions]:
     goal = state.goal
     assert goal is not None
     if goal.failure:
-        text = f"the standstill was long enough, but the controller did not end its move: {goal.failure}"
+        text = f"the standstill was long enough, but the controller gave the move up: {goal.failure}"
         return _end(state, "ABORTED", text, place=True)
     if goal.over is not None:
         then = state.visit + 1

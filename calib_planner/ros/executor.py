@@ -4,27 +4,34 @@
 
 A goal of ``PlanExecution`` ends with the robot's result, or as *lost*: nothing was heard of it (no answer, no
 feedback) for ``silence`` seconds, as the node counts them. A lost goal may be running all the same; it is
-cancelled by the id that ``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called in
-the executor's thread.
+cancelled by the id that ``PlanExecution`` gave it, as soon as somebody offers the service. Everything is called
+in the executor's thread.
 """
 
 from __future__ import annotations
 
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from action_msgs.srv import CancelGoal
 from calib_planner_msgs.action import ExecutePlan
-from rclpy.action import ActionClient
+from calib_planner_msgs.msg import Plan as PlanMessage
 from unique_identifier_msgs.msg import UUID
 
-from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.arrays import check_number
+from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.messages import duration_message, seconds_of
+from calib_planner.ros.parameters import LATCHED
 from calib_planner.units import cut
 
+ACTION = "~/execute_plan"
+LONGEST_DWELL = 600.0
+"""Length of a standstill, at most [s]."""
 MOST_STANDSTILLS = 100_000
 """Standstills of one plan, at most; at a second each that is more than a day."""
 
@@ -43,6 +50,64 @@ def check_executable(plan: Plan, robot: Robot) -> None:
         expected = f"at most {MOST_STANDSTILLS}"
         raise InputError("plan.repetitions, their sum", plan.measurements, expected, "send it in parts")
     robot.check_within_limits("plan.configurations", plan.configurations)
+
+
+def dwell_of(goal: ExecutePlan.Goal) -> float:
+    """Length of a standstill that a goal wants [s]; 0: the node's default.
+
+    Raises:
+        InputError: It is negative or longer than ``LONGEST_DWELL``.
+    """
+    return check_number(
+        "dwell", seconds_of(goal.dwell), low=0.0, high=LONGEST_DWELL, unit="s; 0: the node's default"
+    )
+
+
+def feedback_message(phase: str, index: int, total: int, executed: int, elapsed: float) -> ExecutePlan.Feedback:
+    """Feedback about an execution.
+
+    Args:
+        phase: Name of a phase's constant.
+        index: Row of the configuration under way.
+        total: Configurations of the plan.
+        executed: Standstills completed.
+        elapsed: Time since the execution began [s].
+    """
+    kind = ExecutePlan.Feedback
+    feedback = kind(index=index, total=total, executed=executed, elapsed=duration_message(elapsed))
+    feedback.phase = getattr(kind, phase)
+    return feedback
+
+
+class NewestPlan:
+    """The service ``~/execute`` of a node that offers ``~/execute_plan``: executes the newest plan.
+
+    It sends the goal as any other client would, so that everybody can watch it; made in ``activate`` of ``node``.
+
+    Args:
+        node: Offers the service.
+        topic: Where plans are heard.
+        check: Raises a ``CalibPlannerError`` that says why a goal would not be executed; returns what it means.
+    """
+
+    def __init__(self, node: ManagedNode[Any], topic: str, check: Callable[[ExecutePlan.Goal], str]) -> None:
+        self._topic, self._check, self._plan = topic, check, PlanMessage()
+        self._client = node.create_action_client(ExecutePlan, ACTION)
+        node.create_subscription(PlanMessage, topic, self._on_plan, LATCHED)
+        node.create_trigger("~/execute", self._execute)
+
+    def _on_plan(self, message: PlanMessage) -> None:
+        self._plan = message
+
+    def _execute(self) -> str:
+        goal = ExecutePlan.Goal(plan=self._plan)
+        if not self._plan.plan_id:
+            raise CalibPlannerError(f"no plan was heard on {self._topic}: have one made, by ~/request_plan")
+        words = self._check(goal)
+        if not self._client.server_is_ready():
+            raise CalibPlannerError("the node has just been started: call it again")
+        self._client.send_goal_async(goal)
+        return f"executing plan {cut(self._plan.plan_id, 40)}: {words}; ~/stop ends it, the log says how it went"
 
 
 RESULTS = {
@@ -66,8 +131,7 @@ class PlanExecution:
     """Sends goals to ``action``; made in ``configure`` of ``node``."""
 
     def __init__(self, node: ManagedNode[Any], action: str) -> None:
-        self._client = ActionClient(node, ExecutePlan, action)
-        node.undo_with(self._client.destroy)
+        self._client = node.create_action_client(ExecutePlan, action)
         self._canceller = node.create_client(CancelGoal, f"{action}/_action/cancel_goal")
         self._node, self.action = node, action
         self._goal: UUID | None = None

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -291,7 +291,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         made = super().create_service(srv_type, srv_name, self._safe_service(callback), **others)
         return self._destroyed_later(self.destroy_service, lasting(made) if self._made else made)
 
-    def create_trigger(self, name: str, action: Callable[[], str]) -> None:
+    def create_trigger(self, name: str, action: Callable[[], str], **others: Any) -> None:
         """A service Trigger that answers with the text of ``action``, or with why it is refused."""
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -302,7 +302,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
                 response.message, response.success = cut(error), False
             return response
 
-        self.create_service(Trigger, name, answer)
+        self.create_service(Trigger, name, answer, **others)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *args: Any, **others: Any
@@ -330,6 +330,10 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         usual |= {"callback_group": ReentrantCallbackGroup(), "cancel_callback": lambda _: CancelResponse.ACCEPT}
         made = LastingActionServer(self, kind, name, execute, **(usual | others))
         return self._destroyed_later(lambda server: server.destroy(), made)
+
+    def create_action_client(self, kind: Any, name: str) -> ActionClient:
+        """A client of an action, in the node's own callback group."""
+        return self._destroyed_later(lambda client: client.destroy(), ActionClient(self, kind, name))
 
     def _destroyed_later(self, destroy: Callable[[Any], Any], made: Any) -> Any:
         if self._made:

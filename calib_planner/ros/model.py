@@ -27,7 +27,7 @@ from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import in_ros
 from calib_planner.ros.parameters import LATCHED
-from calib_planner.ros.settings import IdentifierParameters, PlanParameters, unknown_words
+from calib_planner.ros.settings import IdentifierParameters, PlanParameters, RobotParameters, unknown_words
 from calib_planner.units import brief, cut
 
 TOPIC = "robot_description"
@@ -137,7 +137,7 @@ class ModelSource:
         refusal: Why the newest description was refused and which robot stays; empty if it was not refused.
     """
 
-    def __init__(self, settings: PlanParameters) -> None:
+    def __init__(self, settings: RobotParameters) -> None:
         self._settings = settings
         self._text = self.refusal = ""
         self.model: Model | NotReady = NotReady(
@@ -145,7 +145,10 @@ class ModelSource:
             "a request may also name a shipped robot"
         )
         if settings.robot:
-            self.model = shipped_model(settings.robot, settings.parameters, settings.unknown)
+            wanted = (DEFAULT_LEVEL, "")
+            if isinstance(settings, PlanParameters):
+                wanted = (settings.parameters, settings.unknown)
+            self.model = shipped_model(settings.robot, *wanted)
 
     def follow(self, node: ManagedNode[Any], taken: Callable[[Model], None], **options: Any) -> None:
         """In ``configure``: subscribe to descriptions, if they are wanted; ``taken`` gets every new model."""

@@ -33,7 +33,7 @@ from calib_planner.planning import (
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import check_rows, pace_of, seconds_of
 from calib_planner.ros.model import Model, NotReady, shipped_model
-from calib_planner.ros.settings import PlannerParameters, PlanParameters, unknown_words
+from calib_planner.ros.settings import PaceParameters, PlannerParameters, PlanParameters, unknown_words
 from calib_planner.units import brief, cut
 
 MOST_PARAMETERS = 1000
@@ -100,9 +100,10 @@ def _planned(
     return plan_for_time(problem, plan_pace(settings, model), budget, callback=callback).plan
 
 
-def plan_pace(settings: PlannerParameters, model: Model) -> Pace:
+def plan_pace(settings: PaceParameters, model: Model) -> Pace:
     """How fast the robot moves and is measured, by the node's parameters and the robot description."""
-    speeds = (settings.joint_speed, settings.slide_speed, model.speeds)
+    share = settings.speed_share
+    speeds = (share * settings.joint_speed, share * settings.slide_speed, share * model.speeds)
     return pace_of(model.robot, *speeds, settings.dwell, settings.settle)
 
 

@@ -20,6 +20,7 @@ from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.io import config_folder
 from calib_planner.planning import CRITERIA
+from calib_planner.ros.execution import Watch
 from calib_planner.ros.lifecycle import LifecycleParameters
 from calib_planner.ros.parameters import at_configure, constraints_text, described, parameter
 from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, Faults
@@ -32,6 +33,7 @@ ERROR_MODEL = "how the robot errs: typical, paper (noise alone), or the path of 
 FRAME = "accuracy at the test poses: in the frame of the points (world), or up to a rigid motion (robot)"
 BASE_FRAME = "name of the robot's base frame"
 TOPICS = "topics of the tracker's points, one per target"
+PLAN_TOPIC = "topic of the plan that ~/execute executes"
 LARGEST_SEED = 2**31 - 1
 
 
@@ -75,7 +77,20 @@ class PlanParameters(RobotParameters):
 
 
 @dataclass(frozen=True)
-class PlannerParameters(PlanParameters):
+class PaceParameters:
+    """How fast the robot moves and is measured: in the planner, which promises minutes, and in the executor."""
+
+    joint_speed: float = parameter(0.5, "largest speed of turning joints", "rad/s", 1e-3, 100.0)
+    slide_speed: float = parameter(0.1, "largest speed of sliding joints", "m/s", 1e-4, 100.0)
+    speed_share: float = parameter(
+        1.0, "share that is used of these speeds, or of a joint's own limit if that is lower", "", 0.001, 1.0
+    )
+    settle: float = parameter(2.0, "time at rest before each measurement", "s", 0.0, 3600.0)
+    dwell: float = parameter(3.0, "time of each measurement, at rest", "s", 0.0, 3600.0)
+
+
+@dataclass(frozen=True)
+class PlannerParameters(PaceParameters, PlanParameters):
     """Parameters of ``calibration_planner``."""
 
     criterion: str = parameter("test_pose", "the criterion, unless the request says otherwise", choices=CRITERIA)
@@ -91,8 +106,6 @@ class PlannerParameters(PlanParameters):
     )
     accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
     constraints: str = at_configure("", CONSTRAINTS)
-    joint_speed: float = parameter(0.5, "largest speed of turning joints on ~/trajectory", "rad/s", 1e-3, 100.0)
-    slide_speed: float = parameter(0.1, "largest speed of sliding joints on ~/trajectory", "m/s", 1e-4, 100.0)
     time_budget: float = parameter(
         0.0,
         "time for all measurements of a plan, if the request names no number of configurations: the planner "
@@ -101,8 +114,6 @@ class PlannerParameters(PlanParameters):
         0.0,
         864000.0,
     )
-    settle: float = parameter(2.0, "time at rest on ~/trajectory before each measurement", "s", 0.0, 3600.0)
-    dwell: float = parameter(3.0, "time of each measurement on ~/trajectory, at rest", "s", 0.0, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -151,6 +162,30 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
 
 
 @dataclass(frozen=True)
+class ExecutorParameters(Watch, PaceParameters, RobotParameters):
+    """Parameters of ``plan_executor``."""
+
+    controller_action: str = at_configure(
+        "joint_trajectory_controller/follow_joint_trajectory",
+        "action control_msgs/FollowJointTrajectory of the robot's controller",
+    )
+    plan_topic: str = at_configure(
+        "calibration_planner/current_plan", "topic of the plan that ~/execute executes"
+    )
+    locked_topics: tuple[str, ...] = at_configure(
+        ("tracker/locked",),
+        "topics std_msgs/Bool on which the tracker says whether it holds a target, one per target; a topic on "
+        "which nothing was heard is not watched",
+    )
+    step: bool = parameter(False, "wait for ~/confirm before every move")
+    moveit_group: str = at_configure(
+        "", "planning group of MoveIt, which plans every move; empty = straight lines in joint space"
+    )
+    moveit_service: str = at_configure("plan_kinematic_path", "service moveit_msgs/GetMotionPlan of MoveIt")
+    planning_time: float = parameter(5.0, "longest time for the planning of a move", "s", 0.1, 600.0)
+
+
+@dataclass(frozen=True)
 class SimulatorParameters(LifecycleParameters, Faults):
     """Parameters of ``tracker_simulator``."""
 
@@ -180,6 +215,14 @@ class SimulatorParameters(LifecycleParameters, Faults):
     joint_speed: float = parameter(6.0, "largest joint speed", "rad/s", 1e-3, 100.0)
     dwell: float = parameter(0.8, "length of a standstill, per measurement", "s", 0.0, 600.0)
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
+    locked_topics: tuple[str, ...] = at_configure(
+        ("tracker/locked",), "topics on which it says whether the tracker holds its targets"
+    )
+    controller_action: str = at_configure(
+        "joint_trajectory_controller/follow_joint_trajectory",
+        "action control_msgs/FollowJointTrajectory by which the robot is moved, if control_msgs is installed",
+    )
+    plan_topic: str = at_configure("calibration_planner/current_plan", PLAN_TOPIC)
     frame_id: str = at_configure("tracker", "name of the tracker's frame")
 
     def deviations(self, names: Sequence[str]) -> dict[str, float]:
@@ -268,6 +311,7 @@ NODES: dict[str, tuple[type[Any], str]] = {
     "identifier": (IdentifierParameters, "calibration_identifier"),
     "simulator": (SimulatorParameters, "tracker_simulator"),
     "campaign": (CampaignParameters, "calibration_campaign"),
+    "executor": (ExecutorParameters, "plan_executor"),
 }
 """Name of the file in config → parameters and name of the node."""
 

@@ -11,6 +11,6 @@ from calib_planner.simulation.cell import (
     independent_seeds,
     random_deviations,
 )
-from calib_planner.simulation.motion import NANO, Itinerary, Stand, Tour, make_tour
+from calib_planner.simulation.motion import NANO, Followed, Itinerary, Stand, Tour, make_tour
 from calib_planner.simulation.streams import Message, Rates, Streams, play
 from calib_planner.simulation.world import World, simulate_campaign, simulated

@@ -166,6 +166,8 @@ class Faults:
     ``beam_break_interval``: mean time from the end of a beam break to the next one (exponential); during a break
     of ``beam_break_duration`` no target is seen. After each, distances are wrong by one number drawn from a
     normal distribution of standard deviation ``relock_error``, until the next break.
+    ``beam_lost_standing``, ``beam_lost_moving``: share of arrivals, and of departures, at which the tracker loses
+    the targets. It sees none until they are brought back: after ``beam_lost_duration``, or when somebody does so.
 
     *Messages*
 
@@ -202,6 +204,11 @@ class Faults:
     beam_break_interval: float = ranged(0.0, "mean time between beam breaks; 0 = none", "s", 0.0, 1e6)
     beam_break_duration: float = ranged(1.0, "length of a beam break", "s", 0.0, 3600.0)
     relock_error: float = ranged(0.0, "error of distances after a break, std", "m", 0.0, 0.1)
+    beam_lost_standing: float = ranged(0.0, "share of arrivals at which the beam is lost", "", 0.0, 1.0)
+    beam_lost_moving: float = ranged(0.0, "share of departures at which the beam is lost", "", 0.0, 1.0)
+    beam_lost_duration: float = ranged(
+        10.0, "time until it is brought back; 0 = by ~/restore_beam only", "s", 0.0, 1e6
+    )
     dropout_probability: float = ranged(0.0, "share of tracker points never sent", "", 0.0, 1.0)
     tracker_latency: float = ranged(0.0, "tracker points arrive this late", "s", 0.0, 60.0)
     tracker_jitter: float = ranged(0.0, "mean of a further delay of tracker points", "s", 0.0, 60.0)
@@ -241,6 +248,7 @@ class Purpose(IntEnum):
     REORDER_DELAY = 116
     COEFFICIENTS = 117
     VISIT = 118
+    BEAM_LOST = 119
 
 
 def draws(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:

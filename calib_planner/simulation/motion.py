@@ -4,7 +4,8 @@ Between rests all joints move together along s(τ) = 10τ³ − 15τ⁴ + 6τ⁵
 acceleration; the fastest joint reaches ``speed``. Every measurement is a standstill of its own, so the robot
 backs off a little between two at (nearly) the same place.
 
-A ``Tour`` is one execution, from its time 0; an ``Itinerary`` is all of them, one after the other, on a clock.
+A ``Tour`` is one execution, from its time 0, and a ``Followed`` trajectory is one move that somebody else thought
+of; an ``Itinerary`` is all of them, one after the other, on a clock.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from calib_planner.acquisition import NANO
 from calib_planner.arrays import FloatArray, IntArray, frozen
-from calib_planner.planning import PEAK, backed_off, near, smooth
+from calib_planner.planning import PEAK, Trajectory, backed_off, near, smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,15 +135,28 @@ def make_tour(
 
 
 @dataclass(frozen=True, eq=False)
+class Followed:
+    """A trajectory that is followed exactly, from time 0; at its end the robot has arrived for a measurement."""
+
+    way: Trajectory
+
+    def stands(self, times: FloatArray) -> Stand:
+        """Where the robot is at ``times`` (n,) [s], at the end of the trajectory after that."""
+        since = times - self.way.seconds
+        there = since >= 0.0
+        return Stand(self.way.at(times), np.where(there, 0, -1), np.where(there, since, np.inf))
+
+
+@dataclass(frozen=True, eq=False)
 class _Leg:
-    """From ``began`` [ns] on: a tour, or a rest at ``joints``; ``arrivals`` were made before, the last at
-    ``arrived`` [ns] if the robot still stands there."""
+    """From ``began`` [ns] on: a tour, a trajectory, or a rest at ``joints``; ``arrivals`` were made before, the
+    last at ``arrived`` [ns] if the robot still stands there."""
 
     began: int
     joints: FloatArray
     arrivals: int
     arrived: int | None
-    tour: Tour | None = None
+    tour: Tour | Followed | None = None
 
 
 class Itinerary:
@@ -157,7 +171,7 @@ class Itinerary:
     def __init__(self, rest: FloatArray) -> None:
         self._leg = _Leg(0, frozen(rest), 0, None)
 
-    def begin(self, tour: Tour, stamp: int) -> None:
+    def begin(self, tour: Tour | Followed, stamp: int) -> None:
         """Send it on ``tour`` at ``stamp`` [ns]."""
         self.halt(stamp)
         rest = self._leg

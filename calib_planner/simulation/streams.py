@@ -103,6 +103,15 @@ class Streams:
         """What is still under way, in the order of arrival; nothing is sampled."""
         return [heapq.heappop(self._waiting)[3] for _ in range(len(self._waiting))]
 
+    def locked(self, now: int) -> tuple[bool, bool]:
+        """Whether the tracker holds its targets at ``now`` [ns], and whether they are lost for long, if not."""
+        stand, seconds = self._where(np.array([now])), (now - self._start) / NANO
+        return self._sight.locked(stand, seconds), self._sight.lost(stand, seconds)
+
+    def restore_beam(self, now: int) -> bool:
+        """Bring a lost beam back at ``now`` [ns]; whether it was lost."""
+        return self._sight.restore((now - self._start) / NANO)
+
     def _begin(self, now: int) -> None:
         self._now = now
         self._waiting.clear()

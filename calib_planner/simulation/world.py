@@ -148,7 +148,7 @@ class Sight:
         self._noise = [draws(seed, Purpose.NOISE, t) for t in targets]
         self._odd = [draws(seed, Purpose.OUTLIER, t) for t in targets]
         self._odd_size = [draws(seed, Purpose.OUTLIER_SIZE, t) for t in targets]
-        self._breaks = BeamBreaks(world)
+        self._breaks, self._losses = BeamBreaks(world), BeamLosses(world)
         instrument = cell.instrument
         self._station = np.asarray(instrument.station if isinstance(instrument, LaserTracker) else np.zeros(3))
 
@@ -166,8 +166,21 @@ class Sight:
         points = points + wrong[:, None] * beam / np.maximum(np.linalg.norm(beam, axis=1), 1e-9)[:, None]
         points = points + self.world.cell.noise(points, self._noise[target])
         points = points + self._outliers(target, len(points)) + self._far_standstills(target, stand)
-        points[broken] = np.nan
+        points[broken | self._losses.at(stand, seconds)] = np.nan
         return points
+
+    def locked(self, stand: Stand, seconds: float) -> bool:
+        """Whether the tracker holds its targets at that time [s], the robot at ``stand`` (one row)."""
+        at = np.array([seconds])
+        return not (self._breaks.at(at)[0] | self._losses.at(stand, at))[0]
+
+    def lost(self, stand: Stand, seconds: float) -> bool:
+        """Whether they are lost until somebody, or time, brings them back; a break is not that."""
+        return bool(self._losses.at(stand, np.array([seconds]))[0])
+
+    def restore(self, seconds: float) -> bool:
+        """Bring the beam back; whether it was lost."""
+        return self._losses.restore(seconds)
 
     def _from_station(self, points: FloatArray, stand: Stand, seconds: FloatArray) -> FloatArray:
         f, seed = self.world.faults, self.world.seed
@@ -226,6 +239,47 @@ class BeamBreaks:
         latest = begin[np.maximum(count - 1, 0)]
         broken = (count > 0) & (seconds < latest + f.beam_break_duration)
         return broken, np.array(self._wrong)[count]
+
+
+class BeamLosses:
+    """When targets are lost at an arrival or a departure, and until when; the list grows as it is read.
+
+    A departure is seen by joints that differ from those of the look before.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._faults, self._seed = world.faults, world.seed
+        self._known: set[tuple[bool, int]] = set()
+        self._lost: list[tuple[float, float]] = []
+        self._before: FloatArray | None = None
+
+    def at(self, stand: Stand, seconds: FloatArray) -> NDArray[np.bool_]:
+        """(n,) whether they are lost at ``seconds`` (n,), the robot at ``stand``."""
+        f, result = self._faults, np.zeros(len(seconds), bool)
+        if not (f.beam_lost_standing or f.beam_lost_moving) or not len(seconds):
+            return result
+        still = np.isfinite(stand.since)
+        before = stand.joints[:1] if self._before is None else self._before
+        moved = np.any(np.diff(np.vstack([before, stand.joints]), axis=0) != 0.0, axis=1) & ~still
+        self._before = stand.joints[-1:]
+        for rows, moving, share in ((still, False, f.beam_lost_standing), (moved, True, f.beam_lost_moving)):
+            for k in np.unique(stand.arrival[rows]):
+                key = (moving, int(k))
+                if key not in self._known:
+                    self._known.add(key)
+                    first = float(seconds[rows & (stand.arrival == k)][0])
+                    rng = draws(self._seed, Purpose.BEAM_LOST, moving, int(k) + 1)
+                    if rng.random() < share:
+                        self._lost.append((first, first + (f.beam_lost_duration or np.inf)))
+        for begin, end in self._lost:
+            result |= (seconds >= begin) & (seconds < end)
+        return result
+
+    def restore(self, seconds: float) -> bool:
+        """Bring them back at that time [s]; whether they were lost."""
+        lost = any(begin <= seconds < end for begin, end in self._lost)
+        self._lost = [(begin, min(end, seconds)) for begin, end in self._lost]
+        return lost
 
 
 def simulated(world: World, seed: int, reaches: Callable[[FloatArray], bool] = lambda q: True) -> Instrument:

@@ -303,6 +303,25 @@ def test_an_update_says_what_a_fit_at_the_same_scales_says() -> None:
     assert np.sqrt(np.mean(apart**2) / np.mean(np.trace(told.position[40:], axis1=2, axis2=3) / 3.0)) < 0.5
 
 
+def test_updates_tell_nothing_that_no_visit_sees() -> None:
+    """Base and first joint, tip and target cannot be told apart: four combinations are what the prior says."""
+    robot, sizes = ur10e(2), {"gravity": 3e-5, "smooth.size": 2e-4, "short.size": 5e-5}
+    data, _ = simulated(robot, sizes | {"repeatability": 1e-5, "shared": 1e-5}, 46, 3)
+    found = first = fit_error_model(unknown(robot), data.select(np.arange(24)), typical())
+    for count in range(25, 47):
+        found = fit_error_model(unknown(robot), data.select(np.arange(count)), typical(), start=found)
+    assert found.origin.visits == 24
+    count = len(found.knowledge.robot.parameter_names)
+    before, after = (f.knowledge.covariance[:count, :count] for f in (first, found))
+    variances, directions = np.linalg.eigh(before)
+    std, widest = np.sqrt(variances[-4:]), directions[:, -4:]
+    assert std.min() > 0.019  # rad: the tolerance of a joint's zero
+    moved = widest.T @ (found.knowledge.coefficients - first.knowledge.coefficients)[:count]
+    assert np.abs(moved / std).max() < 0.02
+    # What 22 visits tell by the curvature of their positions is far less than a percent.
+    np.testing.assert_allclose(np.sqrt(np.diag(widest.T @ after @ widest)), std, rtol=1e-3)
+
+
 def test_what_an_update_cannot_do_is_a_full_fit() -> None:
     robot = ur10e(2)
     data, _ = simulated(robot, {}, 45, 5)

@@ -122,7 +122,7 @@ def test_the_dwell_begins_when_it_stands() -> None:
 @pytest.mark.parametrize(
     ("manner", "status", "words"),
     [
-        (Manner(refuse=True), "NOT_READY", "it refused the goal; is the controller active"),
+        (Manner(refuse=True), "NOT_READY", "the controller refused the move: is it active"),
         (Manner(answer=NEVER), "ABORTED", "the controller does not answer"),
         (Manner(failure="error -4 path tolerance"), "ABORTED", "error -4 path tolerance"),
         (Manner(rate=0.0), "ABORTED", "q2 is at 0.2000 rad"),

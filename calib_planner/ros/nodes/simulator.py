@@ -1,43 +1,49 @@
 """Node ``tracker_simulator``: a robot with hidden true errors, and a tracker that watches it.
 
 It publishes joint states (what the controller believes) and tracker points (where the true robot is seen), and
-executes plans as the node of a real robot does (see docs/connecting.md). What the messages hold, and what goes
-wrong with them, is in ``simulation``: at every tick the node asks there for what has arrived by now. A tick that
-comes late makes up for what it missed, so that a busy machine delays messages and loses none. The truth is never
-published.
+executes plans as the node of a real robot does (see docs/connecting.md). Where ``control_msgs`` is installed it
+stands in for a robot's controller, too: it follows trajectories as a ``joint_trajectory_controller`` does.
+
+What the messages hold, and what goes wrong with them, is in ``simulation``: at every tick the node asks there for
+what has arrived by now. A tick that comes late makes up for what it missed, so that a busy machine delays
+messages and loses none. The truth is never published.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from calib_planner_msgs.action import ExecutePlan
 from geometry_msgs.msg import PointStamped
+from rclpy.action import GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
 
-from calib_planner.arrays import check_number
 from calib_planner.errors import CalibPlannerError, InputError
 from calib_planner.io import config_folder, read_error_model, read_instrument
-from calib_planner.ros.executor import check_executable
+from calib_planner.planning import Trajectory
+from calib_planner.ros.executor import ACTION, NewestPlan, check_executable, dwell_of, feedback_message
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.messages import (
-    duration_message,
     joints_message,
+    nanoseconds,
     plan_from_message,
     point_message,
-    seconds_of,
 )
 from calib_planner.ros.model import load_shipped
 from calib_planner.ros.parameters import SENSOR_OUT
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import SimulatorParameters
+from calib_planner.ros.ways import FollowJointTrajectory, way_from_message
 from calib_planner.simulation import (
     NANO,
+    Followed,
     Itinerary,
     Rates,
     SimulatedCell,
@@ -47,8 +53,14 @@ from calib_planner.simulation import (
     make_tour,
     random_deviations,
 )
-from calib_planner.units import cut
+from calib_planner.units import counted, cut, listed
 
+LOCKED_PERIOD = 0.1
+"""Time between two messages about the beam, if nothing changes [s]."""
+LONGEST_JUMP = 0.05
+"""How far from the robot a trajectory may begin, unless the goal has tolerances of its own [rad | m]."""
+PREEMPTED = "Current goal cancelled due to new incoming action."
+"""What a joint_trajectory_controller says."""
 FEEDBACK_PERIOD = 0.1
 """Time between two looks at the execution [s]."""
 PATIENCE = 2.0
@@ -62,10 +74,12 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         world: Robot, tracker and faults, once configured: for tests, which may know the truth.
     """
 
-    THREADS = 3
+    THREADS = 5
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        self._work = OneAtATime()
+        self._work, self._halted = OneAtATime(), threading.Event()
+        self._following: ServerGoalHandle | None = None
+        self._locked, self._lost, self._said = True, False, 0
         self._present = threading.Lock()  # a tour begins and ends after everything that was sampled
         super().__init__("tracker_simulator", SimulatorParameters(), context, overrides)
 
@@ -82,6 +96,9 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         self._point_publishers = [
             self.create_publisher(PointStamped, topic, SENSOR_OUT) for topic in chosen.tracker_topics
         ]
+        self._locked_publishers = [
+            self.create_publisher(Bool, topic, SENSOR_OUT) for topic in chosen.locked_topics if topic
+        ]
 
     def activate(self) -> None:
         """Publish, and take plans."""
@@ -90,7 +107,18 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         rates = Rates(chosen.joint_rate, chosen.tracker_rate)
         self._streams = Streams(self.world, self._itinerary.at, rates, self.now)
         self.create_timer(1.0 / max(chosen.joint_rate, chosen.tracker_rate), self._publish)
-        self.create_action_server(ExecutePlan, "~/execute_plan", self._on_goal)
+        self.create_action_server(ExecutePlan, ACTION, self._on_goal)
+        self._newest = NewestPlan(self, chosen.plan_topic, self._check)
+        self.create_trigger("~/stop", self._halt)
+        self.create_trigger("~/restore_beam", self._restore_beam)
+        if FollowJointTrajectory is not None:
+            self.create_action_server(
+                FollowJointTrajectory,
+                chosen.controller_action,
+                self._follow,
+                goal_callback=self._on_trajectory,
+                handle_accepted_callback=self._on_accepted,
+            )
         self.get_logger().info(f"{self.world.robot.name} with hidden errors stands still")
 
     def deactivate(self) -> None:
@@ -112,11 +140,48 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
                 self._point_publishers[message.stream - 1].publish(point)
             else:
                 self._joint_publisher.publish(joints_message(names, message.values, message.stamp))
+        self._publish_locked()
+
+    def _publish_locked(self) -> None:
+        """Say whether the tracker holds its targets: at every change, and now and then."""
+        now, before = self.now, self._locked
+        with self._present:
+            self._locked, self._lost = self._streams.locked(now)
+        if self._locked != before or not 0 <= now - self._said < LOCKED_PERIOD * NANO:
+            self._said = now
+            for publisher in self._locked_publishers:
+                publisher.publish(Bool(data=self._locked))
+
+    # ── plans ────────────────────────────────────────────────────────────────────────────────────────
+
+    def _check(self, goal: ExecutePlan.Goal) -> str:
+        """What ``~/execute`` answers.
+
+        Raises:
+            CalibPlannerError: The goal would not be executed.
+        """
+        if not self._work.ended or self._following is not None:
+            raise CalibPlannerError("the robot moves already: wait, or call ~/stop")
+        plan = plan_from_message(goal.plan).plan
+        check_executable(plan, self.world.robot)
+        return counted(len(plan.configurations), "configuration")
+
+    def _halt(self) -> str:
+        """End what the robot does."""
+        if self._work.ended and self._following is None:
+            return "the robot stands already"
+        self._halted.set()
+        return "the robot stops"
+
+    def _restore_beam(self) -> str:
+        with self._present:
+            lost = self._streams.restore_beam(self.now)
+        return "the tracker holds the target again" if lost else "the beam was not lost"
 
     def _on_goal(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
         kind = ExecutePlan.Result
         with self._work.turn() as mine:
-            if not mine:
+            if not mine or self._following is not None:
                 goal.abort()
                 return kind(status=kind.BUSY, message="another plan is being executed: wait for it or cancel it")
             try:
@@ -134,8 +199,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def _execute(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
         plan = plan_from_message(goal.request.plan).plan
-        asked = seconds_of(goal.request.dwell)
-        dwell = check_number("dwell", asked, low=0.0, high=600.0, unit="s; 0: the node's default")
+        dwell = dwell_of(goal.request)
         check_executable(plan, self.world.robot)
         tour = make_tour(
             self._itinerary.at(np.array([self.now])).joints[0],
@@ -148,6 +212,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             shortest=1.0 / self.settings.value.joint_rate,
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
+        self._halted.clear()
         with self._present:
             began = self.now
             self._itinerary.begin(tour, began)
@@ -159,26 +224,125 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         result = ExecutePlan.Result(executed=tour.standstills(seconds))
         if self._work.closing.is_set():
             return result
-        if goal.is_cancel_requested and seconds < tour.seconds:
+        early = seconds < tour.seconds
+        if early and goal.is_cancel_requested:
             result.status, result.message = ExecutePlan.Result.CANCELLED, "stopped on request"
             goal.canceled()
+        elif early and self._halted.is_set():
+            result.status, result.message = ExecutePlan.Result.STOPPED, "somebody called ~/stop"
+            goal.abort()
+        elif early:
+            words = (
+                "the tracker has lost the reflector: bring it back (~/restore_beam), send the rest of the plan"
+            )
+            result.status, result.message = ExecutePlan.Result.BEAM_LOST, words
+            goal.abort()
         else:
             result.status, result.message = ExecutePlan.Result.SUCCESS, "every configuration was visited"
             goal.succeed()
         return result
 
     def _watch(self, goal: ServerGoalHandle, tour: Tour, began: int, total: int) -> None:
-        """Send feedback until the tour that began at ``began`` [ns] ends or is cancelled."""
+        """Send feedback until the tour that began at ``began`` [ns] ends, by itself or early."""
         while (seconds := (self.now - began) / NANO) < tour.seconds:
-            if goal.is_cancel_requested or self._work.closing.is_set():
+            if goal.is_cancel_requested or self._work.closing.is_set() or self._halted.is_set() or self._lost:
                 return
             phase = tour.at(seconds)
-            kind = ExecutePlan.Feedback
-            feedback = kind(index=phase.index, total=total, executed=tour.standstills(seconds))
-            feedback.phase = kind.MEASURING if phase.measuring else kind.MOVING
-            feedback.elapsed = duration_message(seconds)
-            goal.publish_feedback(feedback)
+            word = "MEASURING" if phase.measuring else "MOVING"
+            done = tour.standstills(seconds)
+            goal.publish_feedback(feedback_message(word, phase.index, total, done, seconds))
             self.rest(FEEDBACK_PERIOD, self._work.closing)
+
+    # ── trajectories, as a joint_trajectory_controller follows them ─────────────────────────────────────
+
+    def _way(self, goal: Any) -> tuple[Trajectory, int]:
+        """What a goal means now: a trajectory, and when it begins [ns].
+
+        Raises:
+            InputError: It is none for this robot.
+        """
+        message, now = goal.trajectory, self.now
+        here = self._itinerary.at(np.array([now])).joints[0]
+        way, names = way_from_message(message, self.world.robot.joint_names, here), list(message.joint_names)
+        if len(names) != len(self.world.robot.joint_names):
+            raise InputError("trajectory.joint_names", listed(names), ", ".join(self.world.robot.joint_names))
+        if any(message.points[-1].velocities):
+            raise InputError("trajectory.points", "a last point that moves", "one at rest")
+        began = nanoseconds(message.header.stamp) or now
+        if began + way.seconds * NANO < now:
+            raise InputError("trajectory.header.stamp", "an end in the past", "zero, or a time to come")
+        return way, began
+
+    def _on_trajectory(self, goal: Any) -> GoalResponse:
+        """Accept a trajectory, or refuse it; as a controller does, without telling the client why."""
+        refused = "" if self._work.ended else "a plan is being executed"
+        try:
+            self._way(goal)
+        except CalibPlannerError as error:
+            refused = str(error)
+        if refused:
+            self.get_logger().error(f"trajectory refused: {cut(refused)}")
+        return GoalResponse.REJECT if refused else GoalResponse.ACCEPT
+
+    def _on_accepted(self, handle: ServerGoalHandle) -> None:
+        """Begin; a goal that is under way ends, since there is a newer one."""
+        self._halted.clear()
+        self._following = handle
+        handle.execute()
+
+    def _follow(self, goal: ServerGoalHandle) -> Any:
+        kind = FollowJointTrajectory.Result
+        try:
+            way, began = self._way(goal.request)
+        except CalibPlannerError as error:  # the robot moved since it was accepted
+            return self._left(goal, kind(error_code=kind.INVALID_GOAL, error_string=cut(error)))
+        here, start = self._itinerary.at(np.array([self.now])).joints[0], way.at([(self.now - began) / NANO])[0]
+        names = self.world.robot.joint_names
+        given = {t.name: t.position for t in goal.request.path_tolerance if t.position > 0}
+        off = np.abs(start - here) - np.array([given.get(name, LONGEST_JUMP) for name in names])
+        if off.max() > 0:
+            words = f"{names[int(off.argmax())]} is {off.max():.4f} beyond its path tolerance at the beginning"
+            return self._left(goal, kind(error_code=kind.PATH_TOLERANCE_VIOLATED, error_string=words))
+        with self._present:
+            if self._is_newest(goal):
+                self._itinerary.begin(Followed(way), began)
+        while (seconds := (self.now - began) / NANO) < way.seconds and self._is_newest(goal):
+            if goal.is_cancel_requested or self._work.closing.is_set() or self._halted.is_set():
+                break
+            goal.publish_feedback(self._trajectory_feedback(way, seconds))
+            self.rest(min(FEEDBACK_PERIOD, way.seconds - seconds), self._work.closing)
+        with self._present:
+            if not self._is_newest(goal):
+                return self._left(goal, kind(error_code=kind.INVALID_GOAL, error_string=PREEMPTED))
+            self._itinerary.halt(self.now)
+        if goal.is_cancel_requested or self._halted.is_set() or self._work.closing.is_set():
+            return self._left(goal, kind(error_code=kind.INVALID_GOAL, error_string="stopped on request"))
+        return self._left(goal, kind())
+
+    def _is_newest(self, goal: ServerGoalHandle) -> bool:
+        """Whether the robot still follows the trajectory of that goal."""
+        return self._following is goal
+
+    def _left(self, goal: ServerGoalHandle, result: Any) -> Any:
+        """End a goal with its result."""
+        if self._is_newest(goal):
+            self._following = None
+        if self.context.ok():
+            if goal.is_cancel_requested:
+                goal.canceled()
+            elif result.error_code == result.SUCCESSFUL:
+                goal.succeed()
+            else:
+                self.get_logger().warning(f"trajectory given up: {result.error_string}")
+                goal.abort()
+        return result
+
+    def _trajectory_feedback(self, way: Trajectory, seconds: float) -> Any:
+        q = way.at([seconds])[0].tolist()
+        feedback = FollowJointTrajectory.Feedback(joint_names=list(self.world.robot.joint_names))
+        feedback.desired.positions = feedback.actual.positions = q
+        feedback.error.positions = [0.0] * len(q)
+        return feedback
 
 
 def make_world(chosen: SimulatorParameters) -> World:
