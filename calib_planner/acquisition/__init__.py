@@ -20,8 +20,10 @@ from calib_planner.acquisition.messages import (
     STATE,
     TRANSFORMS,
     JointReader,
+    PointLike,
     pick_joints,
     points_in,
+    stamp_of,
 )
 from calib_planner.acquisition.standstill import (
     IN_A_ROW,

@@ -1,8 +1,9 @@
 """From messages to standstills: one intake for the topics of a node and for the messages of a recording.
 
-Only the stamps in the headers count. Several publishers may share the robot's joints, on one topic or on several:
-each part of the joints is a stream of its own (``rest.py``). The points of all targets are in one frame, the first
-one that is named: a mean of points in two frames has no meaning. What takes no part is counted by reason.
+Only the stamps in the headers count. Several publishers may share the robot's joints, on one topic or on
+several: each part of the joints is a stream of its own (``rest.py``). The points of all targets are in one frame,
+the first one that is named: a mean of points in two frames has no meaning. What takes no part is counted by
+reason.
 """
 
 from __future__ import annotations
@@ -16,12 +17,9 @@ import numpy as np
 from calib_planner.acquisition.clocks import NANO
 from calib_planner.acquisition.messages import (
     MOST_NAMES,
-    POINT,
-    TRANSFORMS,
     JointReader,
     JointStateLike,
     PointLike,
-    points_in,
     stamp_of,
 )
 from calib_planner.acquisition.standstill import (
@@ -33,7 +31,7 @@ from calib_planner.acquisition.standstill import (
     StandstillSettings,
 )
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.units import brief
+from calib_planner.units import brief, listed
 
 UNREADABLE, UNSTAMPED, UNFIT = "not decodable", "without a stamp", "without the robot's joints"
 NOT_FINITE, DROPPED, OTHER_FRAME = "not finite", "too late or twice", "in another frame"
@@ -142,7 +140,9 @@ class Intake:
         self._children = tuple(children) or ("",) * len(topics)
         self._lost = [False] * len(topics)
         s = settings
-        self._longest = round((s.skew + s.gap + s.window) * NANO)  # that a part of the joints may be behind another
+        self._longest = round(
+            (s.skew + s.gap + s.window) * NANO
+        )  # that a part of the joints may be behind another
         self.use(joint_names)
 
     def use(self, joint_names: Sequence[str] | None) -> None:
@@ -156,7 +156,7 @@ class Intake:
         self._every = frozenset(range(len(names)))
         for count in self.streams:
             count.columns = frozenset()
-        self._first = 0  # stamp of the first state of some joints only
+        self._first = self._newest = 0  # stamps of states of some joints only, after the last pause
         self.detector = StandstillDetector(len(names), targets, self._settings) if names else None
         for target, lost in enumerate(self._lost):
             if self.detector is not None:
@@ -183,23 +183,27 @@ class Intake:
         return self._explained(self.detector.add_joints(stamp, joints, columns))
 
     def _hear(self, topic: int, columns: tuple[int, ...] | None, stamp: int) -> None:
-        """Note which joints a state has; refuse one of some joints if the others are not heard at about that time.
+        """Note which joints a state has; refuse one of some joints if others are not heard at about that time.
 
         Raises:
-            UnknownNameError: Of one of them nothing was heard for longer than a stream may be behind another.
+            InputError: Of one of them nothing was heard for longer than a stream may be behind another.
         """
         if columns is None:
             self._heard = [stamp] * len(self._names)
             self.streams[topic].columns = self._every
             return
         self.streams[topic].columns |= {*columns}
-        self._first = self._first or stamp
+        if stamp - self._newest > round(self._settings.gap * NANO):
+            self._first = stamp
+        self._newest = max(self._newest, stamp)
         for k in columns:
             self._heard[k] = max(self._heard[k], stamp)
-        for k, newest in enumerate(self._heard):
-            if stamp - (newest or self._first) > self._longest:
-                heard = [n for n, at in zip(self._names, self._heard, strict=True) if at]
-                raise UnknownNameError("name", self._names[k], heard[:MOST_NAMES])
+        silent = [k for k, at in enumerate(self._heard) if stamp - max(at, self._first) > self._longest]
+        if silent:
+            got = f"nothing of {listed([self._names[k] for k in silent])} for {self._longest / NANO:g} s"
+            raise InputError(
+                "name", got, "every joint, in this message or in others", "is the topic listened to?"
+            )
 
     @property
     def unheard(self) -> tuple[str, ...]:
@@ -207,16 +211,8 @@ class Intake:
         heard = frozenset[int]().union(*(count.columns for count in self.streams))
         return tuple(name for k, name in enumerate(self._names) if k not in heard)
 
-    def point(self, target: int, message: PointLike, kind: str = POINT) -> list[Standstill | Rejection]:
-        """Take a message about a target, from 0, of one of the types in ``POINTS``; what it completes."""
-        child = self._children[target]
-        if kind == TRANSFORMS and not child:
-            text = "transforms of any child_frame_id: say which one is the target"
-            self.streams[self.joint_topics + target].leave_out(OTHER_FRAME, text)
-            return []
-        return [r for point in points_in(kind, message, child) for r in self._one_point(target, point)]
-
-    def _one_point(self, target: int, message: PointLike) -> list[Standstill | Rejection]:
+    def point(self, target: int, message: PointLike) -> list[Standstill | Rejection]:
+        """Take a point of a target, from 0, as ``points_in`` reads it; what it completes."""
         count, stamp, frame = self.streams[self.joint_topics + target], stamp_of(message), message.header.frame_id
         if not count.stamped(stamp) or self.detector is None:
             return []

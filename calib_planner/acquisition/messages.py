@@ -1,8 +1,9 @@
 """What is read out of the messages of drivers, the same for the topics of a node and for a recording.
 
-A message is anything with the fields of its type: those of rclpy and those that rosbags decodes are alike. Joints
-come as ``sensor_msgs/msg/JointState``, which names them every time, in its own order, among others, and perhaps only
-some of them. Where a target is comes as a point, or as a pose or a transform, of which the position is taken.
+A message is anything with the fields of its type: those of rclpy and those that rosbags decodes are alike.
+Joints come as ``sensor_msgs/msg/JointState``, which names them every time, in its own order, among others, and
+perhaps only some of them. Where a target is comes as a point, or as a pose or a transform, whose position is
+taken.
 """
 
 from __future__ import annotations
@@ -126,7 +127,9 @@ class JointReader:
         """
         names, positions = tuple(message.name), message.position
         if len(names) != len(positions):
-            raise InputError("position", f"{len(positions)} positions for {len(names)} names", "one position per name")
+            raise InputError(
+                "position", f"{len(positions)} positions for {len(names)} names", "one position per name"
+            )
         layout = self._layouts.get(names)
         if layout is None:
             layout = self._layout(names)

@@ -1,13 +1,13 @@
 """Rests of streams: the samples since a stream came to rest, and the rest of joints that come in parts.
 
-A ``RestWindow`` is the rest of one stream. The joints of a robot may come in parts, each in messages of its own and
-at a rate of its own: a rail and an arm, say. Each part is then judged by itself, as a stream, and the robot is at
-rest where all of its parts are: from the latest beginning to the earliest of their last samples. Between two
-samples of a slow part nobody knows whether it moves, so that the rest is known to last only up to the earlier one.
+A ``RestWindow`` is the rest of one stream. The joints of a robot may come in parts, each in messages of its own
+and at a rate of its own: a rail and an arm, say. Each part is then judged by itself, as a stream, and the robot
+is at rest where all of its parts are: from the latest beginning to the earliest of their last samples. Between
+two samples of a slow part nobody knows whether it moves: the rest is known to last up to the earlier one.
 
-Which joints form a part is not stated but seen. In the beginning all joints are one part. A message that names some
-joints of a part only divides the part into those that it names and the others. So every joint belongs to one part,
-whatever messages name it, and there are never more parts than joints.
+Which joints form a part is not stated but seen. In the beginning all joints are one part. A message that names
+some joints of a part only divides the part into those that it names and the others. So every joint belongs to one
+part, whatever messages name it, and there are never more parts than joints.
 """
 
 from __future__ import annotations
@@ -178,12 +178,12 @@ class JointRest:
 
     def divide(self, columns: Iterable[int]) -> list[JointPart]:
         """Divide the parts that hold some of ``columns`` and other joints as well; the divided ones."""
-        wanted, kept, divided = set(columns), [], []
+        wanted, parts, divided = set(columns), [], []
         for part in self.parts:
             both = [[c for c in part.columns if (c in wanted) == inside] for inside in (True, False)]
-            kept += [self._part(half) for half in both] if all(both) else [part]
+            parts += [self._part(half) for half in both] if all(both) else [part]
             divided += [part] if all(both) else []
-        self.parts = sorted(kept, key=lambda p: p.columns)
+        self.parts = sorted(parts, key=lambda p: p.columns)
         return divided
 
     def begin(self) -> None:

@@ -19,12 +19,12 @@ The two streams see a motion at different times, and a motion must not spoil the
 * A motion ends slowly: its end is within the tolerance of the first samples at rest, and noise may break the rest
   for it much later. Then the rest begins later, within ``settle`` of its first sample, and goes on.
 
-Joints may come in parts (``rest.py``): all of this then holds for the part that moves first and comes to rest last,
-and points wait for the next state of every part.
+Joints may come in parts (``rest.py``): all of this then holds for the part that moves first and comes to rest
+last, and points wait for the next state of every part.
 
 A tracker may say that it has lost a target. It says so without a stamp: what counts is which points came before.
-Those stamped within ``window`` before the newest one are taken for lost as well, since they may have been overtaken;
-and so are all up to the newest one that came while the target was lost.
+Those stamped within ``window`` before the newest one are taken for lost as well, since they may have been
+overtaken; and so are all up to the newest one that came while the target was lost.
 
 The tolerance on points has to be several times the tracker's noise: with σ = 0.03 mm the range of a thousand
 samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do as well as live ones.
@@ -98,7 +98,7 @@ REJECTIONS = {
     RejectionReason.TIME_SKEW.value: "The stamps of joints and tracker do not overlap. Synchronise the clocks.",
     RejectionReason.OTHER_FRAME.value: "Points came in another frame_id than before. Publish all in one frame.",
     RejectionReason.NOT_FINITE.value: "Values are not finite. Check line of sight and the drivers.",
-    RejectionReason.TARGET_LOST.value: "The tracker had lost the target. Clear the line of sight, lock on, measure again.",
+    RejectionReason.TARGET_LOST.value: "The tracker had lost the target. Lock on again, then measure again.",
 }
 """Value of a ``RejectionReason`` → what it means and what to do."""
 
@@ -238,7 +238,11 @@ class StandstillDetector:
         """Take a point (3,) [m] of target number ``target``, from 0; NaN = not seen."""
         self._check_target(target)
         values = check_array("xyz", xyz, (3,), finite=False)
-        return [] if self._losses[target].takes(stamp, _ns(self.settings.window)) else self._add(self.joint_count + target, stamp, values)
+        return (
+            []
+            if self._losses[target].takes(stamp, _ns(self.settings.window))
+            else self._add(self.joint_count + target, stamp, values)
+        )
 
     def set_lost(self, target: int, lost: bool) -> None:
         """The tracker says that it has lost target number ``target``, from 0, or that it sees it (again)."""
@@ -348,7 +352,9 @@ class StandstillDetector:
             self.clocks.add_joints(self._measured_since, until or stamp)
             self._measured = None
             joints.clear()
-        elif joints.at_rest and not part.window.goes_on(stamp, value) and not part.window.begin_later(stamp, value):
+        elif (
+            joints.at_rest and not part.window.goes_on(stamp, value) and not part.window.begin_later(stamp, value)
+        ):
             results = self._moved_on(part)
         if not joints.at_rest:
             self._complained = self._saw_nan = False

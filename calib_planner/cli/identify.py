@@ -219,7 +219,15 @@ def _with_targets(robot: Robot, sources: Sources, args: argparse.Namespace) -> R
 
 STANDSTILL = ("joint_tolerance", "point_tolerance", "settle", "duration", "samples", "minimum_samples")
 """Fields of ``StandstillSettings`` that are options."""
-BAG_ONLY = ("joint_topic", "point_topic", "child_frame", "state_topic", *STANDSTILL, "repeatability", "accept_damaged")
+BAG_ONLY = (
+    "joint_topic",
+    "point_topic",
+    "child_frame",
+    "state_topic",
+    *STANDSTILL,
+    "repeatability",
+    "accept_damaged",
+)
 
 
 def add_data(parser: argparse.ArgumentParser) -> None:
@@ -246,7 +254,7 @@ def add_bags(parser: argparse.ArgumentParser) -> None:
     bags = parser.add_argument_group("measurements from bags (docs/real-robot-data.md)")
     text = "topic of sensor_msgs/JointState; repeat, if each has some of the joints (joint_states)"
     option(bags, "--joint-topic", "T", text, action="append")
-    text = "topic of PointStamped, PoseStamped, TransformStamped or TFMessage; repeat, one per reflector (tracker/point)"
+    text = "topic of points, poses or transforms, stamped; repeat, one per reflector (tracker/point)"
     option(bags, "--point-topic", "T", text, action="append")
     text = "child_frame_id of the reflector, in transforms; repeat, one per reflector (the first one that comes)"
     option(bags, "--child-frame", "NAME", text, action="append")

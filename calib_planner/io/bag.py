@@ -37,6 +37,7 @@ from calib_planner.acquisition import (
     OTHER_FRAME,
     POINTS,
     STATE,
+    TRANSFORMS,
     UNFIT,
     UNREADABLE,
     UNSTAMPED,
@@ -189,7 +190,7 @@ def _units(recording: Recording, robot: Robot, stated: Units) -> tuple[Units, tu
 
 def _check_streams(path: str | Path, intake: Intake, joint_names: Sequence[str]) -> None:
     joints, points = intake.streams[: intake.joint_topics], intake.streams[intake.joint_topics :]
-    for number, stream in enumerate(intake.streams):
+    for stream in intake.streams:
         where = f"topic {stream.name}"
         if not stream.messages:
             raise FileFormatError(path, where, "no messages", "at least one standstill's", "was the driver on?")
@@ -203,7 +204,9 @@ def _check_streams(path: str | Path, intake: Intake, joint_names: Sequence[str])
                 names = ", ".join(unheard or joint_names)
                 advice = f"name the topics that position {names}: one --joint-topic each"
             wanted = "stamped, finite positions of the robot's joints"
-            raise FileFormatError(path, where, got, wanted if stream in joints else "stamped, finite points", advice)
+            raise FileFormatError(
+                path, where, got, wanted if stream in joints else "stamped, finite points", advice
+            )
     for one, other in ((j, p) for p in points for j in joints):
         apart = max(other.first - one.last, one.first - other.last)
         if apart > 0:
@@ -297,8 +300,9 @@ class _BagIntake:
         if stream >= len(intake.streams):
             intake.tracker_state(stream - len(intake.streams), bool(message.data))
         elif target >= 0:
-            self._sort(intake.point(target, message, recording.kinds[stream]))
-            self._check_frame(intake.streams[stream])
+            for point in recording.points(target, message):
+                self._sort(intake.point(target, point))
+                self._check_frame(intake.streams[stream])
         else:
             self._take_joints(stream, message)
 
@@ -476,7 +480,13 @@ def _kinds(path: str | Path, readers: list[Any], topics: BagTopics) -> tuple[str
             raise FileFormatError(path, f"topic {name}", got, f"messages of {wanted}", advice)
         if name not in fitting:
             raise FileFormatError(path, f"topic {name}", ", ".join(sorted(types_of[name])), wanted, advice)
-    return tuple(next(iter(types_of[name])) for name in names)
+    kinds = tuple(next(iter(types_of[name])) for name in names)
+    if TRANSFORMS in kinds and not topics.children:
+        where, advice = f"topic {names[kinds.index(TRANSFORMS)]}", "name one per target with --child-frame"
+        raise FileFormatError(
+            path, where, "transforms of many frames", "the child_frame_id of the target", advice
+        )
+    return kinds
 
 
 def _write_ahead(path: str | Path) -> str:

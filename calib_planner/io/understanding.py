@@ -48,8 +48,8 @@ class BagTopics:
 
     Attributes:
         joints: Topics of sensor_msgs/JointState: one, or several that hold some of the joints each.
-        points: Topics of geometry_msgs/PointStamped, PoseStamped or TransformStamped or of tf2_msgs/TFMessage, one
-            per target, in their order.
+        points: Topics of geometry_msgs/PointStamped, PoseStamped or TransformStamped, or of tf2_msgs/TFMessage,
+            one per target, in their order.
         children: The child_frame_id of each target, for transforms; empty: the first one that comes.
         states: Topics of std_msgs/Bool on which the tracker says whether it sees each target; empty: none.
     """
@@ -72,7 +72,9 @@ class BagTopics:
             raise InputError("topics", got, "topics of joints and one per target, each once")
         for name in ("children", "states"):
             if len(getattr(self, name)) not in (0, len(self.points)):
-                raise InputError(name, listed(getattr(self, name)), f"{len(self.points)}, one per target, or none")
+                raise InputError(
+                    name, listed(getattr(self, name)), f"{len(self.points)}, one per target, or none"
+                )
 
     @property
     def names(self) -> tuple[str, ...]:

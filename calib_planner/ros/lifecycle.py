@@ -135,6 +135,15 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         """In ``configure`` or ``activate``: call ``callback(*args)`` on the way back, the last one first."""
         self._made[-1].callback(callback, *args)
 
+    @contextmanager
+    def as_configured(self) -> Iterator[None]:
+        """What is made in this context stays until ``clean_up``, as if ``configure`` had made it."""
+        later, self._made = self._made[1:], self._made[:1]
+        try:
+            yield
+        finally:
+            self._made += later
+
     @property
     def is_active(self) -> bool:
         """Whether the state is *active*."""

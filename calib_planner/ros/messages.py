@@ -69,7 +69,9 @@ PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency", "seconds")
 """Fields of ``PlanQuality`` and of the message that are the same number."""
 MEASUREMENT_STATUS = {
     word: getattr(
-        Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}", Measurement.REJECTED_NOT_FINITE
+        Measurement,
+        word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}",
+        Measurement.REJECTED_NOT_FINITE,
     )
     for word in DECISIONS
 }

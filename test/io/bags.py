@@ -62,7 +62,7 @@ def campaign(
 
 
 def message(said: Said) -> Any:
-    """The ROS message; ``extra`` may set ``frame_id``, the ``kind`` of a stream from 1, the ``child`` of a transform."""
+    """The ROS message; ``extra`` may set ``frame_id``, ``kind`` of streams from 1, ``child`` of transforms."""
     time = T["builtin_interfaces/msg/Time"](sec=said.stamp // NANO, nanosec=said.stamp % NANO)
     header = T["std_msgs/msg/Header"](stamp=time, frame_id=said.extra.get("frame_id", "tracker"))
     kind = said.extra.get("kind", POINT)
