@@ -70,7 +70,8 @@ def used(workspace: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "options", repeats([()], [(), ("--symlink-install",), ("--merge-install",), ("--merge-install", "--symlink-install")])
+    "options",
+    repeats([()], [(), ("--symlink-install",), ("--merge-install",), ("--merge-install", "--symlink-install")]),
 )
 def test_the_ordinary_command_builds_the_interfaces_too(workspace: Path, options: tuple[str, ...]) -> None:
     done = colcon(workspace, *options)

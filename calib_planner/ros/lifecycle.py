@@ -227,7 +227,8 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             getattr(self, hook)()
         except Exception as error:
             self.failure = reason_of(error)
-            self.get_logger().error(f"cannot {hook}: {self.failure}")
+            if self.context.ok():  # else the process is ending, which is no fault
+                self.get_logger().error(f"cannot {hook}: {self.failure}")
             self._attempt(self._made.pop().close)
             return FAILURE
         return SUCCESS
@@ -249,7 +250,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             self._first = None
         if self.state == "unconfigured" and self.trigger_configure() == SUCCESS:
             self.trigger_activate()
-        if self.failure:
+        if self.failure and self.context.ok():
             name = self.get_fully_qualified_name()
             advice = f"remedy it, then: ros2 lifecycle set {name} configure, and activate"
             self.get_logger().error(f"not started; {advice}")
