@@ -1,9 +1,9 @@
 """Package of the library, its command line and its ROS 2 nodes (ament_python).
 
 *The interfaces* are a package of their own in ``msg_defs``, since an ament_python package cannot generate any.
-colcon does not look for packages below another one, so that ``colcon build`` finds this package alone and installs
-it last: then it has the interfaces built here, by colcon itself, into the same workspace. Where colcon was told of
-both (``--base-paths``, or a link beside the checkout), or where they are installed already, nothing is built here.
+colcon does not look for packages below another one, so that ``colcon build`` finds this package alone. When it
+is installed the interfaces are built, too, by colcon itself and into the same workspace. Where colcon was told
+of both (``--base-paths``, or a link beside the checkout), or where they are installed already, nothing is built.
 """
 
 import os

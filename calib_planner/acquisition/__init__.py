@@ -6,13 +6,24 @@ docs/glossary.md explains the words.
 from calib_planner.acquisition.clocks import Offset
 from calib_planner.acquisition.intake import (
     DROPPED,
+    OTHER_FRAME,
     UNFIT,
     UNREADABLE,
     UNSTAMPED,
     Intake,
-    JointReader,
     StreamCount,
+)
+from calib_planner.acquisition.messages import (
+    JOINT_STATE,
+    POINT,
+    POINTS,
+    STATE,
+    TRANSFORMS,
+    JointReader,
+    PointLike,
     pick_joints,
+    points_in,
+    stamp_of,
 )
 from calib_planner.acquisition.standstill import (
     IN_A_ROW,

@@ -1,11 +1,9 @@
 """From messages to standstills: one intake for the topics of a node and for the messages of a recording.
 
-A message is anything with the fields of ``sensor_msgs/msg/JointState`` or ``geometry_msgs/msg/PointStamped``:
-those of rclpy and those that rosbags decodes are alike. Only the stamps in their headers count. A joint state
-names its joints every time, in its own order and among others; where each one stands is remembered as long as
-the names stay the same. Several publishers may share the robot's joints: their states are put together. The
-points of all targets are in one frame, the first one that is named: a mean of points in two frames has no
-meaning. What takes no part is counted by reason.
+Only the stamps in the headers count. Several publishers may share the robot's joints, on one topic or on
+several: each part of the joints is a stream of its own (``rest.py``). The points of all targets are in one frame,
+the first one that is named: a mean of points in two frames has no meaning. What takes no part is counted by
+reason.
 """
 
 from __future__ import annotations
@@ -13,12 +11,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calib_planner.acquisition.clocks import NANO
+from calib_planner.acquisition.messages import (
+    MOST_NAMES,
+    JointReader,
+    JointStateLike,
+    PointLike,
+    stamp_of,
+)
 from calib_planner.acquisition.standstill import (
     IN_A_ROW,
     Rejection,
@@ -27,46 +30,14 @@ from calib_planner.acquisition.standstill import (
     StandstillDetector,
     StandstillSettings,
 )
-from calib_planner.arrays import FloatArray, frozen
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.units import brief
-
-JointStateLike: TypeAlias = Any
-PointLike: TypeAlias = Any
-
-MOST_NAMES = 50
-"""Names that an error lists."""
-
-
-def pick_joints(names: Sequence[str], positions: ArrayLike, joint_names: Sequence[str]) -> FloatArray:
-    """Positions (joints,) [rad | m] in the order wanted; other joints are ignored, values may be NaN.
-
-    Args:
-        names: Joints of the message, in any order.
-        positions: (names,) their positions [rad | m].
-        joint_names: Joints wanted.
-
-    Raises:
-        UnknownNameError: A joint is missing.
-        InputError: A name is there twice, or names and positions differ in number.
-    """
-    names, values = list(names), np.asarray(positions, dtype=float)
-    if len(names) != len(values):
-        raise InputError("position", f"{len(values)} positions for {len(names)} names", "one position per name")
-    where = {name: i for i, name in enumerate(names)}
-    for name in joint_names:
-        if name not in where:
-            raise UnknownNameError("name", name, list(dict.fromkeys(filter(None, names)))[:MOST_NAMES])
-    if len(where) != len(names):
-        doubled = sorted({n for n in joint_names if names.count(n) > 1})
-        if doubled:
-            raise InputError("name", f"{', '.join(doubled)} more than once", "each joint once")
-    return frozen(values[[where[name] for name in joint_names]])
-
+from calib_planner.units import brief, listed
 
 UNREADABLE, UNSTAMPED, UNFIT = "not decodable", "without a stamp", "without the robot's joints"
 NOT_FINITE, DROPPED, OTHER_FRAME = "not finite", "too late or twice", "in another frame"
+LOST = "while the target was lost"
 """Why a message takes no part. Values that are not finite mean: the target was not seen."""
+LOST_TEXT = "the tracker says that it has lost the target"
 LONGEST_FRAME = 500
 """Characters that are kept of a frame's name, which may come from anyone."""
 
@@ -83,6 +54,7 @@ class StreamCount:
         example: What was wrong with the first message that was left out, where there is more to say.
         lost: Messages that were not delivered, as the middleware says.
         first, last: Smallest and largest stamp [ns]; 0 before the first.
+        columns: Numbers of the robot's joints that it has named, from 0.
     """
 
     name: str
@@ -93,6 +65,7 @@ class StreamCount:
     lost: int = 0
     first: int = 0
     last: int = 0
+    columns: frozenset[int] = frozenset()
     _before: int = 0
 
     @property
@@ -132,142 +105,155 @@ class StreamCount:
         return f"{self.name}: {self.messages} messages" + (f", left out: {lost}" if lost else "")
 
 
-def stamp_of(message: JointStateLike | PointLike) -> int:
-    """The stamp in a message's header [ns]."""
-    return int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
-
-
-PARTS_APART = NANO // 10
-"""States of some joints each belong together if their stamps are no further apart [ns]: as long as a robot is
-given to settle, so that a value from before the rest does not look like one of the rest."""
-
-
-class JointReader:
-    """Reads joint states that name joints in any order, among others.
-
-    A state that names only some of the joints is put together with those before it: the result is complete once
-    every joint came since the last complete one.
-
-    Args:
-        joint_names: Joints wanted, in the order wanted.
-    """
-
-    def __init__(self, joint_names: Sequence[str]) -> None:
-        self._wanted = tuple(joint_names)
-        self._names: list[str] = []
-        self._columns: list[int] = []
-        self._latest: dict[str, tuple[int, float]] = {}
-        self._waiting = set(self._wanted)
-
-    def read(self, message: JointStateLike) -> FloatArray | None:
-        """Positions (joints,) [rad | m] in the order wanted; values may be NaN. ``None``: other joints are to
-        come.
-
-        Raises:
-            UnknownNameError: A joint is missing, and no state shortly before had it.
-            InputError: A name is there twice, or names and positions differ in number.
-        """
-        names, positions = message.name, message.position
-        if names != self._names or not names:
-            if len(names) == len(positions) and self._is_part(names):
-                return self._together(stamp_of(message), names, positions)
-            pick_joints(names, positions, self._wanted)
-            self._names, self._columns = list(names), [names.index(n) for n in self._wanted]
-        elif len(positions) != len(names):
-            got = f"{len(positions)} positions for {len(names)} names"
-            raise InputError("position", got, "one position per name")
-        return np.array([positions[k] for k in self._columns])
-
-    def _is_part(self, names: Sequence[str]) -> bool:
-        """Whether a state names some of the joints, each once, but not all."""
-        ours = [n for n in names if n in self._wanted]
-        return 0 < len(ours) < len(self._wanted) and len(set(ours)) == len(ours)
-
-    def _together(self, stamp: int, names: Sequence[str], positions: Sequence[float]) -> FloatArray | None:
-        for name, value in zip(names, positions, strict=True):
-            if name in self._wanted:
-                self._latest[name] = stamp, float(value)
-                self._waiting.discard(name)
-        for name in self._wanted:
-            if name not in self._latest or abs(stamp - self._latest[name][0]) > PARTS_APART:
-                raise UnknownNameError("name", name, list(names)[:MOST_NAMES])
-        if self._waiting:
-            return None
-        self._waiting = set(self._wanted)
-        return np.array([self._latest[name][1] for name in self._wanted])
-
-
 class Intake:
     """From messages to standstills.
 
     Args:
         joint_names: The robot's joints; ``None``: not known yet, messages are counted only.
-        joint_topic, topics: Names of the streams, a target each.
+        joint_topics: Names of the streams of joints.
+        topics: Names of the streams of points, a target each.
         settings: What counts as standing still.
+        children: The ``child_frame_id`` of each target, for transforms; without them the first one that comes.
 
     Attributes:
-        streams: The count of every stream, joints first.
+        streams: The count of every stream, those of joints first.
+        joint_topics: How many of them are of joints.
         frame: Points of other frames are refused; empty: the next frame named. Points that name none are taken.
         bound: Whether that frame has to stay, since points in it are kept. Else another one takes its place when
             ``IN_A_ROW`` points in a row, of all targets, are in it.
+        metre: The unit of the points' coordinates [m].
     """
 
     def __init__(
         self,
         joint_names: Sequence[str] | None,
-        joint_topic: str,
+        joint_topics: Sequence[str],
         topics: Sequence[str],
         settings: StandstillSettings,
+        children: Sequence[str] = (),
     ) -> None:
-        self.streams = [StreamCount(name) for name in (joint_topic, *topics)]
+        self.streams = [StreamCount(name) for name in (*joint_topics, *topics)]
+        self.joint_topics = len(joint_topics)
         self.frame, self.bound, self._strange = "", False, 0
+        self.metre = 1.0
         self._settings = settings
+        self._children = tuple(children) or ("",) * len(topics)
+        self._lost = [False] * len(topics)
+        s = settings
+        self._longest = round(
+            (s.skew + s.gap + s.window) * NANO
+        )  # that a part of the joints may be behind another
         self.use(joint_names)
 
     def use(self, joint_names: Sequence[str] | None) -> None:
         """Begin anew for a robot with these joints."""
         names = self._names = tuple(joint_names or ())
         self._reader = JointReader(names)
-        targets = len(self.streams) - 1
+        targets = len(self.streams) - self.joint_topics
         self._other_frame = [""] * targets
+        self._child = list(self._children)
+        self._heard: list[int] = [0] * len(names)  # newest stamp of every joint, 0 before the first
+        self._every = frozenset(range(len(names)))
+        for count in self.streams:
+            count.columns = frozenset()
+        self._first = self._newest = 0  # stamps of states of some joints only, after the last pause
         self.detector = StandstillDetector(len(names), targets, self._settings) if names else None
+        for target, lost in enumerate(self._lost):
+            if self.detector is not None:
+                self.detector.set_lost(target, lost)
 
-    def joints(self, message: JointStateLike) -> list[Standstill | Rejection]:
-        """Take a joint state; what it completes.
+    def joints(self, message: JointStateLike, topic: int = 0) -> list[Standstill | Rejection]:
+        """Take a joint state from a topic, from 0; what it completes.
 
         Raises:
             InputError: Without the robot's joints, the same for thousands of messages perhaps.
         """
-        count, stamp = self.streams[0], stamp_of(message)
+        count, stamp = self.streams[topic], stamp_of(message)
         if not count.stamped(stamp) or self.detector is None:
             return []
         try:
-            joints = self._reader.read(message)
+            columns, joints = self._reader.read(message)
+            self._hear(topic, columns, stamp)
         except InputError as error:
             names = f"it names {', '.join(message.name[:MOST_NAMES])}"
             count.leave_out(UNFIT, str(error), names if isinstance(error, UnknownNameError) else str(error))
             raise
-        if joints is None:
-            return []
         if not np.isfinite(joints).all():
             count.left_out[NOT_FINITE] += 1
-        return self._explained(self.detector.add_joints(stamp, joints))
+        return self._explained(self.detector.add_joints(stamp, joints, columns))
+
+    def _hear(self, topic: int, columns: tuple[int, ...] | None, stamp: int) -> None:
+        """Note which joints a state has; refuse one of some joints if others are not heard at about that time.
+
+        Raises:
+            InputError: Of one of them nothing was heard for longer than a stream may be behind another.
+        """
+        if columns is None:
+            self._heard = [stamp] * len(self._names)
+            self.streams[topic].columns = self._every
+            return
+        self.streams[topic].columns |= {*columns}
+        if stamp - self._newest > round(self._settings.gap * NANO):
+            self._first = stamp
+        self._newest = max(self._newest, stamp)
+        for k in columns:
+            self._heard[k] = max(self._heard[k], stamp)
+        silent = [k for k, at in enumerate(self._heard) if stamp - max(at, self._first) > self._longest]
+        if silent:
+            got = f"nothing of {listed([self._names[k] for k in silent])} for {self._longest / NANO:g} s"
+            raise InputError(
+                "name", got, "every joint, in this message or in others", "is the topic listened to?"
+            )
+
+    @property
+    def unheard(self) -> tuple[str, ...]:
+        """Joints that no state has named so far."""
+        heard = frozenset[int]().union(*(count.columns for count in self.streams))
+        return tuple(name for k, name in enumerate(self._names) if k not in heard)
 
     def point(self, target: int, message: PointLike) -> list[Standstill | Rejection]:
-        """Take a point of a target, from 0; what it completes."""
-        count, stamp, frame = self.streams[1 + target], stamp_of(message), message.header.frame_id
+        """Take a point of a target, from 0, as ``points_in`` reads it; what it completes."""
+        count, stamp, frame = self.streams[self.joint_topics + target], stamp_of(message), message.header.frame_id
         if not count.stamped(stamp) or self.detector is None:
             return []
-        if frame and frame != self.frame and not self._enter_frame(frame[:LONGEST_FRAME]):
+        other = self._other_child(target, getattr(message, "child_frame_id", ""))
+        if not other and frame and frame != self.frame and not self._enter_frame(frame[:LONGEST_FRAME]):
             other = f"frame_id {brief(frame, 40)}, the points before are in {brief(self.frame, 40)}"
-            self._other_frame[target] = f"{other}: publish all in one frame, or call ~/reset"
-            count.leave_out(OTHER_FRAME, self._other_frame[target])
+            other += ": publish all in one frame, or call ~/reset"
+        self._other_frame[target] = other
+        if other:
+            count.leave_out(OTHER_FRAME, other)
             return []
-        self._other_frame[target], self._strange = "", 0
-        xyz = np.array((message.point.x, message.point.y, message.point.z))
+        self._strange = 0
+        if self._lost[target]:
+            count.leave_out(LOST, LOST_TEXT)
+        xyz = self.metre * np.array((message.point.x, message.point.y, message.point.z))
         if not np.isfinite(xyz).all():
             count.left_out[NOT_FINITE] += 1
         return self._explained(self.detector.add_point(target, stamp, xyz))
+
+    def _other_child(self, target: int, child: str) -> str:
+        """Why a transform to ``child`` is not the target's; empty if it is."""
+        wanted = self._child[target] = self._child[target] or child[:LONGEST_FRAME]
+        if not child or child == wanted:
+            return ""
+        text = f"child_frame_id {brief(child, 40)}, the target is {brief(wanted, 40)}"
+        return f"{text}: publish one body per topic, or say which child_frame_id is the target"
+
+    def tracker_state(self, target: int, locked: bool) -> None:
+        """The tracker says whether it sees a target, from 0: ``True`` = locked, ``False`` = lost."""
+        self._lost[target] = not locked
+        self.streams[self.joint_topics + target].reason = "" if locked else LOST_TEXT
+        if self.detector is not None:
+            self.detector.set_lost(target, not locked)
+
+    def dropped(self, stream: int) -> int:
+        """Finite messages of a stream that came too late, twice or with a clock set back."""
+        if self.detector is None:
+            return 0
+        if stream < self.joint_topics:
+            return self.detector.joints_dropped(self.streams[stream].columns)
+        return self.detector.points_dropped(stream - self.joint_topics)
 
     def _enter_frame(self, frame: str) -> bool:
         self._strange += 1

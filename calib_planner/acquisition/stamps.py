@@ -9,6 +9,7 @@ Arrival times play no part.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -44,11 +45,35 @@ class StampOrder(Generic[T]):
     skew: int
     _heap: list[tuple[int, int, int, T]] = field(default_factory=list)
     _state: list[_Stream] = field(default_factory=list)
+    _expected: list[_Stream] = field(default_factory=list)
+    _numbers: tuple[int, ...] = ()
     _count: int = 0
     _frontier: int | None = None
 
     def __post_init__(self) -> None:
         self._state = [_Stream() for _ in range(self.streams)]
+        self.expect(range(self.streams))
+
+    def expect(self, numbers: Iterable[int]) -> None:
+        """Wait for these streams only: no others send messages."""
+        self._numbers = tuple(numbers)
+        self._expected = [self._state[k] for k in self._numbers]
+
+    def clear(self) -> None:
+        """Forget all messages, but not how many were dropped."""
+        self._heap.clear()
+        self._frontier = None
+        self._state = [_Stream(dropped=s.dropped) for s in self._state]
+        self.expect(self._numbers)
+
+    def newest(self, stream: int) -> int | None:
+        """Largest stamp of the stream [ns]; ``None`` before the first."""
+        return self._state[stream].newest
+
+    def withdraw(self, stream: int, after: int) -> None:
+        """Forget the stream's messages that wait and are stamped later than ``after`` [ns]."""
+        self._heap = [entry for entry in self._heap if entry[1] != stream or entry[0] <= after]
+        heapq.heapify(self._heap)
 
     def add(self, stream: int, stamp: int, value: T) -> bool:
         """Take a message; ``False`` if it came too late and was dropped."""
@@ -80,7 +105,7 @@ class StampOrder(Generic[T]):
 
     def lag(self, stream: int) -> int:
         """How far the stream lies behind the most advanced one [ns]."""
-        newest = [s.newest for s in self._state if s.newest is not None]
+        newest = [s.newest for s in self._expected if s.newest is not None]
         own = self._state[stream].newest
         return 0 if own is None else max(newest) - own
 
@@ -103,7 +128,7 @@ class StampOrder(Generic[T]):
         return out
 
     def _advance(self) -> None:
-        newest = [s.newest for s in self._state]
+        newest = [s.newest for s in self._expected]
         heard = [n for n in newest if n is not None]
         if not heard:
             return
@@ -115,6 +140,7 @@ class StampOrder(Generic[T]):
         """Forget a stream's past: its clock was set back, or one stamp was far in the future."""
         others = [entry for entry in self._heap if entry[1] != stream]
         self._state[stream] = _Stream(dropped=self._state[stream].dropped + len(self._heap) - len(others))
+        self.expect(self._numbers)
         self._heap = others
         heapq.heapify(self._heap)
         self._frontier = None

@@ -19,6 +19,13 @@ The two streams see a motion at different times, and a motion must not spoil the
 * A motion ends slowly: its end is within the tolerance of the first samples at rest, and noise may break the rest
   for it much later. Then the rest begins later, within ``settle`` of its first sample, and goes on.
 
+Joints may come in parts (``rest.py``): all of this then holds for the part that moves first and comes to rest
+last, and points wait for the next state of every part.
+
+A tracker may say that it has lost a target. It says so without a stamp: what counts is which points came before.
+Those stamped within ``window`` before the newest one are taken for lost as well, since they may have been
+overtaken; and so are all up to the newest one that came while the target was lost.
+
 The tolerance on points has to be several times the tracker's noise: with σ = 0.03 mm the range of a thousand
 samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do as well as live ones.
 """
@@ -26,22 +33,21 @@ samples is about 6.5σ = 0.2 mm. Nothing here knows ROS; messages from a bag do 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from enum import Enum
-from itertools import takewhile
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib_planner.acquisition.clocks import NANO, ClockOffsets
+from calib_planner.acquisition.rest import MOST_SAMPLES, JointPart, JointRest, RestWindow
 from calib_planner.acquisition.stamps import StampOrder
 from calib_planner.arrays import FloatArray, IntArray, check_array, check_count, check_ranges, frozen, ranged
 from calib_planner.errors import InputError
-from calib_planner.units import length, milliseconds
+from calib_planner.units import length, listed, milliseconds
 
-MOST_SAMPLES = 20_000
-"""Samples of one stream that a standstill holds at most."""
 IN_A_ROW = 50
 """So many unusable messages in a row get a rejection of their own."""
 
@@ -83,6 +89,7 @@ class RejectionReason(Enum):
     TIME_SKEW = "time_skew"
     OTHER_FRAME = "other_frame"
     NOT_FINITE = "not_finite"
+    TARGET_LOST = "target_lost"
 
 
 REJECTIONS = {
@@ -91,6 +98,7 @@ REJECTIONS = {
     RejectionReason.TIME_SKEW.value: "The stamps of joints and tracker do not overlap. Synchronise the clocks.",
     RejectionReason.OTHER_FRAME.value: "Points came in another frame_id than before. Publish all in one frame.",
     RejectionReason.NOT_FINITE.value: "Values are not finite. Check line of sight and the drivers.",
+    RejectionReason.TARGET_LOST.value: "The tracker had lost the target. Lock on again, then measure again.",
 }
 """Value of a ``RejectionReason`` → what it means and what to do."""
 
@@ -159,38 +167,103 @@ class StandstillDetector:
         self.settings = s = settings or StandstillSettings()
         self.joint_count = check_count("joints", joints, high=1000)
         self.target_count = check_count("targets", targets, high=1000)
-        self._order: StampOrder[FloatArray] = StampOrder(1 + targets, _ns(s.window), _ns(s.skew))
+        self._order: StampOrder[FloatArray] = StampOrder(joints + targets, _ns(s.window), _ns(s.skew))
         horizon, gap = _ns(s.settle + max(s.patience, s.duration) + s.gap), _ns(s.gap)
-        self._joints = RestWindow(s.joint_tolerance, gap, _ns(s.settle), horizon)
+        self._joints = JointRest(RestWindow(s.joint_tolerance, gap, _ns(s.settle), horizon), joints)
         self._targets = [RestWindow(s.point_tolerance, gap, _ns(s.settle), horizon) for _ in range(targets)]
         self.clocks = ClockOffsets(targets, _ns(s.skew), _ns(s.duration) // 2)
         self._measured: FloatArray | None = None
-        self._rest = (0, 0)  # stamps of the rest in which something was measured, so far
-        self._joints_until: int | None = None  # last stamp of the joints in order
-        self._waiting: deque[tuple[int, int, FloatArray]] = deque()  # (target, stamp, point) after it
+        self._measured_since = 0  # stamp from which on the joints were at rest that were measured
+        self._waiting: deque[tuple[int, int, FloatArray]] = deque()  # (target, stamp, point) for the next joints
         self._complained = False
         self._saw_nan = False
-        self._nan_in_a_row = [0] * (1 + targets)
-        self._complained_at = [-(2**63)] * (1 + targets)  # about a stream, stamps [ns]
+        self._losses = [TargetLoss() for _ in range(targets)]
+        self._nan_in_a_row = [0] * (joints + targets)
+        self._complained_at = [-(2**63)] * (joints + targets)  # about a stream, stamps [ns]
+        self._arrange()
 
-    def add_joints(self, stamp: int, positions: ArrayLike) -> list[Standstill | Rejection]:
-        """Take joint positions (joints,) [rad | m] with their stamp [ns]; NaN = unusable."""
+    def add_joints(
+        self, stamp: int, positions: ArrayLike, columns: tuple[int, ...] | None = None
+    ) -> list[Standstill | Rejection]:
+        """Take joint positions [rad | m] with their stamp [ns]; NaN = unusable.
+
+        Args:
+            stamp: When they were read [ns].
+            positions: (joints,) of all joints, or (k,) of those in ``columns``.
+            columns: Numbers of the k joints, from 0, ascending.
+        """
         meaning = "joint positions in rad or m"
-        shape = (self.joint_count,)
-        return self._add(0, stamp, check_array("positions", positions, shape, finite=False, meaning=meaning))
+        if columns is None:
+            values = check_array("positions", positions, (self.joint_count,), finite=False, meaning=meaning)
+            if len(self._joints.parts) == 1:
+                return self._add(0, stamp, values)
+            columns = self._all
+        else:
+            values = check_array("positions", positions, (len(columns),), finite=False, meaning=meaning)
+        routes = self._routes.get(columns)
+        if routes is None:
+            routes = self._route(columns)
+        results: list[Standstill | Rejection] = []
+        for stream, rows in routes:
+            results += self._add(stream, stamp, values[rows])
+        return results
+
+    def _route(self, columns: tuple[int, ...]) -> list[tuple[int, IntArray]]:
+        """(stream, rows) of every part among these joints, from now on."""
+        rising = all(a < b for a, b in pairwise((-1, *columns, self.joint_count)))
+        if not columns or not rising:
+            raise InputError("columns", columns, f"numbers from 0 to {self.joint_count - 1}, ascending")
+        divided = self._joints.divide(columns)
+        if any(self._order.newest(p.columns[0]) is not None for p in divided):
+            self._order.clear()  # states of the whole part may be waiting
+            self._waiting.clear()
+            self._measured = None
+            self._joints.begin()
+        self._arrange()
+        row = {column: k for k, column in enumerate(columns)}
+        parts = [p for p in self._joints.parts if p.columns[0] in row]
+        routes = [(p.columns[0], np.array([row[c] for c in p.columns])) for p in parts]
+        self._routes[columns] = routes
+        return routes
+
+    def _arrange(self) -> None:
+        """Follow the parts of the joints."""
+        self._all = tuple(range(self.joint_count))
+        self._part = {p.columns[0]: p for p in self._joints.parts}
+        self._routes: dict[tuple[int, ...], list[tuple[int, IntArray]]] = {}
+        n = self.joint_count
+        self._order.expect((*self._part, *range(n, n + self.target_count)))
 
     def add_point(self, target: int, stamp: int, xyz: ArrayLike) -> list[Standstill | Rejection]:
         """Take a point (3,) [m] of target number ``target``, from 0; NaN = not seen."""
+        self._check_target(target)
+        values = check_array("xyz", xyz, (3,), finite=False)
+        return (
+            []
+            if self._losses[target].takes(stamp, _ns(self.settings.window))
+            else self._add(self.joint_count + target, stamp, values)
+        )
+
+    def set_lost(self, target: int, lost: bool) -> None:
+        """The tracker says that it has lost target number ``target``, from 0, or that it sees it (again)."""
+        self._check_target(target)
+        loss, stream = self._losses[target], self.joint_count + target
+        if lost and not loss.now:
+            newest = self._order.newest(stream)
+            if newest is not None:
+                self._order.withdraw(stream, newest - _ns(self.settings.window))
+        loss.now, loss.seen = lost, loss.seen or lost
+
+    def _check_target(self, target: int) -> None:
         if not 0 <= target < self.target_count:
             raise InputError("target", target, f"0 to {self.target_count - 1}")
-        return self._add(1 + target, stamp, check_array("xyz", xyz, (3,), finite=False))
 
     def flush(self) -> list[Standstill | Rejection]:
         """Take what still waits, and the last standstill as ended: the end of a recording."""
         results = self._process(everything=True) + self._ended()
         self.clocks.clear()
         self._waiting.clear()
-        self._joints.samples.clear()
+        self._joints.clear()
         self._measured = None
         return results
 
@@ -208,10 +281,14 @@ class StandstillDetector:
         """Rests of the joints [ns] with a target's stamps more than ``bound`` [s] off, see ``ClockOffsets``."""
         return [rest for k in range(self.target_count) for rest in self.clocks.beyond(k, bound)]
 
-    @property
-    def dropped(self) -> tuple[int, ...]:
-        """Finite messages that took no part, joints first, then each target: too late, twice or set back."""
-        return tuple(self._order.dropped(k) for k in range(1 + self.target_count))
+    def joints_dropped(self, columns: Iterable[int]) -> int:
+        """Finite states that took no part: too late, twice or set back; of that of these joints with most."""
+        streams = {p.columns[0] for p in self._joints.parts if {*columns} & {*p.columns}}
+        return max((self._order.dropped(k) for k in streams), default=0)
+
+    def points_dropped(self, target: int) -> int:
+        """Finite points of a target, from 0, that took no part: too late, twice or set back."""
+        return self._order.dropped(self.joint_count + target)
 
     # ── from messages to events in order ─────────────────────────────────────────────────────────────
 
@@ -220,7 +297,7 @@ class StandstillDetector:
         if not np.isfinite(value).all():
             self._saw_nan = True
             self._nan_in_a_row[stream] += 1
-            text = f"{self._nan_in_a_row[stream]} messages in a row from {_name(stream)} are not finite"
+            text = f"{self._nan_in_a_row[stream]} messages in a row from {self._name(stream)} are not finite"
             text += ": check line of sight and driver"
             bad = self._nan_in_a_row[stream] >= IN_A_ROW
             return self._complaint(stream, stamp, RejectionReason.NOT_FINITE, text) if bad else []
@@ -239,72 +316,83 @@ class StandstillDetector:
         self._complained_at[stream] = stamp
         return [self._rejection(stamp, stamp, reason, text)]
 
+    def _name(self, stream: int) -> str:
+        if stream >= self.joint_count:
+            return f"target {stream - self.joint_count + 1}"
+        if len(self._joints.parts) == 1:
+            return "the joints"
+        return "joint " + listed([str(c + 1) for c in self._part[stream].columns])
+
     def _lags(self, stream: int) -> bool:
         """Whether a stream lies so far behind the others that it takes no part."""
         return self._order.late(stream) >= IN_A_ROW
 
     def _lag_text(self, stream: int) -> str:
-        text = f"stamps from {_name(stream)} lie {self._order.lag(stream) / NANO:.3g} s behind the others"
+        text = f"stamps from {self._name(stream)} lie {self._order.lag(stream) / NANO:.3g} s behind the others"
         return f"{text}: synchronise the clocks, or raise skew if its messages take that long"
 
     def _process(self, *, everything: bool = False) -> list[Standstill | Rejection]:
         results: list[Standstill | Rejection] = []
         for stamp, stream, value in self._order.ready(everything=everything):
-            if stream:
-                self._waiting.append((stream - 1, stamp, value))
+            if stream >= self.joint_count:
+                self._waiting.append((stream - self.joint_count, stamp, value))
                 results += self._on_silence(stamp)
             else:
-                results += self._on_joints(stamp, value)
-                self._on_points()
+                results += self._on_joints(self._part[stream], stamp, value)
+                self._on_points(self._joints.until)
             results += self._complete(stamp)
         return results
 
-    def _on_joints(self, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
+    def _on_joints(self, part: JointPart, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
         joints, results = self._joints, []
-        self._joints_until = stamp
+        until, part.until = joints.until, stamp
         if self._measured is not None:
-            if np.max(np.abs(value - self._measured)) <= joints.tolerance:
-                self._rest = (self._rest[0], stamp)
+            if np.max(np.abs(value - self._measured[list(part.columns)])) <= joints.tolerance:
                 return []
-            self.clocks.add_joints(*self._rest)
+            self.clocks.add_joints(self._measured_since, until or stamp)
             self._measured = None
-            joints.samples.clear()
-        elif joints.samples and not joints.goes_on(stamp, value) and not joints.begin_later(stamp, value):
-            results = self._moved_on()
-        if not joints.samples:
+            joints.clear()
+        elif (
+            joints.at_rest and not part.window.goes_on(stamp, value) and not part.window.begin_later(stamp, value)
+        ):
+            results = self._moved_on(part)
+        if not joints.at_rest:
             self._complained = self._saw_nan = False
+            for loss in self._losses:
+                loss.seen = loss.now
             for window in self._targets:
                 window.moved_by, window.before = 0.0, None
-        joints.push(stamp, value)
+        part.window.push(stamp, value)
         return results
 
-    def _moved_on(self) -> list[Standstill | Rejection]:
-        """The joints' rest has ended without a result so far."""
+    def _moved_on(self, part: JointPart) -> list[Standstill | Rejection]:
+        """The joints' rest has ended, by this part, without a result so far."""
         rest = self._joints.since, self._joints.last
         results = self._ended()
         if self._measured is None:
             self.clocks.add_joints(*rest)
-            self._joints.samples.clear()
+            self._joints.end(part)
         return results
 
     def _on_silence(self, stamp: int) -> list[Standstill | Rejection]:
         """Let the points in without a joint state, if the joints' last one is a gap before ``stamp`` [ns]."""
-        until, gap = self._joints_until, self._joints.gap
+        until, gap = self._joints.until, self._joints.gap
         if until is not None and 0 <= stamp - until <= gap and len(self._waiting) < MOST_SAMPLES:
             return []
-        over = self._measured is None and self._joints.samples and stamp - self._joints.last > gap
-        results = self._moved_on() if over else []
+        results = []
+        if self._measured is None and self._joints.at_rest and stamp - self._joints.last > gap:
+            results = self._moved_on(min(self._joints.parts, key=lambda p: p.window.last))
         self._on_points()
         return results
 
-    def _on_points(self) -> None:
-        """Take the points that waited."""
-        while self._waiting:
+    def _on_points(self, until: int | None = None) -> None:
+        """Take the points that waited, up to ``until`` [ns] if that is given."""
+        while self._waiting and (until is None or self._waiting[0][1] <= until):
             self._on_point(*self._waiting.popleft())
 
     def _on_point(self, target: int, stamp: int, value: FloatArray) -> None:
         window, begin = self._targets[target], self._joints.since + _ns(self.settings.settle)
-        at_rest = self._joints.samples and self._measured is None and window.last >= begin
+        at_rest = self._joints.at_rest and self._measured is None and window.last >= begin
         if at_rest and window.on_time(stamp):
             spread = window.spread_with(value)
             if spread > window.tolerance:
@@ -319,7 +407,7 @@ class StandstillDetector:
         """The result, if there is enough by ``stamp``, or if patience has run out."""
         s, joints = self.settings, self._joints
         begin = joints.since + _ns(s.settle)
-        if self._measured is not None or not joints.samples or stamp - begin < _ns(s.duration):
+        if self._measured is not None or not joints.at_rest or stamp - begin < _ns(s.duration):
             return []
         end = min(stamp, joints.last)
         if all(len(w.samples) >= s.samples and end - w.last <= w.gap for w in self._targets):
@@ -337,7 +425,7 @@ class StandstillDetector:
         settle = _ns(self.settings.settle)
         begin, end = self._joints.since + settle, self._joints.last
         brief = end - begin < _ns(self.settings.duration) // 2
-        if self._measured is not None or not self._joints.samples or brief:
+        if self._measured is not None or not self._joints.at_rest or brief:
             return []
         windows = [w.until_it_left(end - settle) for w in self._targets]
         return self._what_there_is(begin, end, windows)
@@ -359,13 +447,12 @@ class StandstillDetector:
 
     def _take(self, standstill: Standstill) -> list[Standstill | Rejection]:
         self._measured = standstill.joints
-        self._rest = (self._joints.since, self._joints.last)
-        self._joints.samples.clear()
+        self._measured_since = self._joints.since
+        self._joints.clear()
         return [standstill]
 
     def _average(self, start: int, end: int, least: int, windows: Sequence[RestWindow]) -> Standstill | None:
         """Means over [start, end] of the targets with at least ``least`` samples; None if there are none."""
-        q = self._joints.between(start, end)
         points = np.full((self.target_count, 3), np.nan)
         std = np.full(self.target_count, np.nan)
         samples = np.zeros(self.target_count, np.int64)
@@ -376,11 +463,15 @@ class StandstillDetector:
             points[k], samples[k] = rows.mean(axis=0), len(rows)
             if len(rows) > 1:
                 std[k] = np.sqrt(rows.var(axis=0, ddof=1).mean() / len(rows))
-        if not len(q) or not samples.any():
+        if start > end or not samples.any():
             return None
-        return Standstill(start, end, *map(frozen, (q.mean(axis=0), points, std, samples)))
+        return Standstill(start, end, *map(frozen, (self._joints.mean(start, end), points, std, samples)))
 
     def _why(self, begin: int, end: int) -> tuple[RejectionReason, str]:
+        lost = [str(k + 1) for k, loss in enumerate(self._losses) if loss.seen]
+        if lost:
+            text = f"the tracker said that it had lost target {listed(lost)}"
+            return RejectionReason.TARGET_LOST, f"{text}: clear the line of sight and lock on"
         moved = [w.moved_by for w in self._targets]
         if max(moved) > 0:
             k = int(np.argmax(moved))
@@ -393,7 +484,7 @@ class StandstillDetector:
                 RejectionReason.MOVED,
                 f"the robot moved on {(end - begin) / NANO:.2f} s after settling: dwell longer",
             )
-        behind = next((k for k in range(1, 1 + self.target_count) if self._lags(k)), None)
+        behind = next((k for k in range(self.joint_count, len(self._nan_in_a_row)) if self._lags(k)), None)
         if behind is not None:
             return RejectionReason.TIME_SKEW, self._lag_text(behind)
         s, most = self.settings, max(len(w.between(begin, end)) for w in self._targets)
@@ -405,129 +496,32 @@ class StandstillDetector:
         )
 
     def _rejection(self, start: int, end: int, reason: RejectionReason, message: str) -> Rejection:
-        last = self._joints.samples[-1][1] if self._joints.samples else np.full(self.joint_count, np.nan)
         samples = np.array([len(w.between(start, end)) if w.samples else 0 for w in self._targets])
-        return Rejection(start, end, reason, message, frozen(last), frozen(samples))
+        return Rejection(start, end, reason, message, frozen(self._joints.newest), frozen(samples))
 
 
-def _name(stream: int) -> str:
-    return f"target {stream}" if stream else "the joints"
+@dataclass
+class TargetLoss:
+    """What the tracker says of a target.
+
+    Attributes:
+        now: Whether it is lost.
+        seen: Whether it was, at the same rest of the joints.
+        until: Stamp of the newest point that came while it was lost [ns].
+    """
+
+    now: bool = False
+    seen: bool = False
+    until: int = -(2**63)
+
+    def takes(self, stamp: int, window: int) -> bool:
+        """Whether a point with this stamp [ns] is one of a lost target, ``window`` [ns] before such a one."""
+        self.until = stamp if self.now else self.until
+        return self.now or 0 <= self.until - stamp <= window
 
 
 def _ns(seconds: float) -> int:
     return round(seconds * NANO)
-
-
-# ── The samples of one stream since it came to rest; one that breaks the rest begins a new one ──────────────
-
-
-@dataclass
-class RestWindow:
-    """See the module.
-
-    Attributes:
-        tolerance: Largest range of a coordinate [rad | m].
-        gap: Longest pause between samples [ns].
-        settle: Time after a motion whose samples may be farther from later ones [ns].
-        horizon: Samples older than this are forgotten [ns].
-        since, last: Stamps of the first and the last sample of the rest [ns].
-        arrived: Whether a motion came before the rest, as far as seen: not a gap.
-        left: Stamp of the sample that broke this rest, which was kept; 0 while it is the newest [ns].
-        moved_by: Kept for who asks why there was no standstill [m].
-        before: The longest rest during the standstill of the joints that was broken.
-        samples: ``(stamp, value)``, the oldest first.
-    """
-
-    tolerance: float
-    gap: int
-    settle: int
-    horizon: int
-    since: int = 0
-    last: int = 0
-    arrived: bool = False
-    left: int = 0
-    moved_by: float = 0.0
-    before: RestWindow | None = None
-    samples: deque[tuple[int, FloatArray]] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
-    _low: FloatArray = field(default_factory=lambda: np.empty(0))
-    _high: FloatArray = field(default_factory=lambda: np.empty(0))
-    _first: int = 0  # stamp of the first sample, also where the rest begins later by now
-    _late: tuple[int, FloatArray, FloatArray] | None = None  # from ``settle`` after it: first stamp, range
-
-    def on_time(self, stamp: int) -> bool:
-        """Whether ``stamp`` follows the last sample without a gap."""
-        return bool(self.samples) and 0 < stamp - self.last <= self.gap
-
-    def goes_on(self, stamp: int, value: FloatArray) -> bool:
-        """Whether the rest goes on with ``value`` at ``stamp`` [ns]."""
-        return self.on_time(stamp) and self.spread_with(value) <= self.tolerance
-
-    def settled(self, settle: int) -> int:
-        """Stamp from which on it is at rest, ``settle`` [ns] after a motion."""
-        return self.since + settle * self.arrived
-
-    def spread_with(self, value: FloatArray) -> float:
-        """Range, largest over the coordinates, were ``value`` to join."""
-        return float(np.max(np.maximum(self._high, value) - np.minimum(self._low, value)))
-
-    def push(self, stamp: int, value: FloatArray) -> tuple[int, int] | None:
-        """Take a sample; one that breaks the rest begins a new one, and gives the old one's interval [ns]."""
-        ended = None
-        if not self.goes_on(stamp, value) and not self.begin_later(stamp, value):
-            self.arrived = self.on_time(stamp)
-            ended = (self.since, self.last) if self.samples else None
-            self.samples.clear()
-            self._late = None
-            self._low = self._high = value
-            self.since = self._first = stamp
-        self._low, self._high = np.minimum(self._low, value), np.maximum(self._high, value)
-        if stamp > self._first + self.settle:
-            _, low, high = self._late or (stamp, value, value)
-            self._late = (
-                (stamp if self._late is None else self._late[0]),
-                np.minimum(low, value),
-                np.maximum(high, value),
-            )
-        self.last = stamp
-        self.samples.append((stamp, value))
-        while self.samples[0][0] < stamp - self.horizon:
-            self.samples.popleft()
-        return ended
-
-    def begin_later(self, stamp: int, value: FloatArray) -> bool:
-        """Whether the rest goes on with ``value`` at ``stamp`` [ns] if it begins later; from now on it does.
-
-        It may begin with any sample up to the first one ``settle`` after its first.
-        """
-        if not self.on_time(stamp):
-            return False
-        head = list(takewhile(lambda s: s[0] <= self._first + self.settle, self.samples))
-        stamps = [t for t, _ in head] + ([] if self._late is None else [self._late[0]])
-        rows = np.array([v for _, v in head] + ([] if self._late is None else list(self._late[1:])) + [value])
-        low, high = (f.accumulate(rows[::-1])[::-1] for f in (np.minimum, np.maximum))
-        fits = np.flatnonzero(np.max(high - low, axis=1)[: len(stamps)] <= self.tolerance)
-        if not len(fits):
-            return False
-        k = int(fits[0])
-        self.since, self.arrived, self._low, self._high = stamps[k], True, low[k], high[k]
-        for _ in range(k):
-            self.samples.popleft()
-        return True
-
-    def keep(self, stamp: int, begin: int) -> None:
-        """Keep this rest, which ``stamp`` breaks, unless a longer one lasted beyond ``begin`` [ns]."""
-        other = self.before
-        if other is None or other.last < begin or len(other.samples) <= len(self.samples):
-            self.before = replace(self, left=stamp, before=None, samples=self.samples.copy())
-
-    def until_it_left(self, after: int) -> RestWindow:
-        """The rest before, if it was broken at ``after`` [ns] or later; else this one."""
-        return self.before if self.before is not None and self.before.left >= after else self
-
-    def between(self, start: int, end: int) -> FloatArray:
-        """(samples, n) values with stamps in [start, end]."""
-        rows = [v for t, v in self.samples if start <= t <= end]
-        return np.array(rows).reshape(len(rows), len(self._low))
 
 
 # ── How uncertain the mean points of standstills are ────────────────────────────────────────────────────────

@@ -219,7 +219,15 @@ def _with_targets(robot: Robot, sources: Sources, args: argparse.Namespace) -> R
 
 STANDSTILL = ("joint_tolerance", "point_tolerance", "settle", "duration", "samples", "minimum_samples")
 """Fields of ``StandstillSettings`` that are options."""
-BAG_ONLY = ("joint_topic", "point_topic", *STANDSTILL, "repeatability", "accept_damaged")
+BAG_ONLY = (
+    "joint_topic",
+    "point_topic",
+    "child_frame",
+    "state_topic",
+    *STANDSTILL,
+    "repeatability",
+    "accept_damaged",
+)
 
 
 def add_data(parser: argparse.ArgumentParser) -> None:
@@ -244,9 +252,14 @@ def add_points(data: Group) -> None:
 def add_bags(parser: argparse.ArgumentParser) -> None:
     """What bags need."""
     bags = parser.add_argument_group("measurements from bags (docs/real-robot-data.md)")
-    option(bags, "--joint-topic", "T", "topic of sensor_msgs/JointState (joint_states)")
-    text = "topic of PointStamped, PoseStamped or TransformStamped; repeat, one per reflector (tracker/point)"
+    text = "topic of sensor_msgs/JointState; repeat, if each has some of the joints (joint_states)"
+    option(bags, "--joint-topic", "T", text, action="append")
+    text = "topic of points, poses or transforms, stamped; repeat, one per reflector (tracker/point)"
     option(bags, "--point-topic", "T", text, action="append")
+    text = "child_frame_id of the reflector, in transforms; repeat, one per reflector (the first one that comes)"
+    option(bags, "--child-frame", "NAME", text, action="append")
+    text = "topic of std_msgs/Bool: whether the tracker sees the reflector; repeat, one per reflector (none)"
+    option(bags, "--state-topic", "T", text, action="append")
     for field in (f for f in fields(StandstillSettings) if f.name in STANDSTILL):
         unit = f" [{field.metadata['unit']}]" if field.metadata["unit"] else ""
         text = f"{field.metadata['description']}{unit} ({field.default:g})"
@@ -266,7 +279,12 @@ def source_reading(args: argparse.Namespace, terminal: Terminal) -> Reading:
         points=tuple(args.points or ()),
         point_columns=args.point_columns or (),
         match=args.match or "",
-        topics=BagTopics(args.joint_topic or "joint_states", tuple(args.point_topic or ("tracker/point",))),
+        topics=BagTopics(
+            args.joint_topic or ("joint_states",),
+            args.point_topic or ("tracker/point",),
+            args.child_frame or (),
+            args.state_topic or (),
+        ),
         standstill=StandstillSettings(**given),
         repeatability=args.repeatability or 0.0,
         accept_damaged=bool(args.accept_damaged),

@@ -32,7 +32,12 @@ import numpy as np
 
 from calib_planner.acquisition import (
     DROPPED,
+    JOINT_STATE,
     NANO,
+    OTHER_FRAME,
+    POINTS,
+    STATE,
+    TRANSFORMS,
     UNFIT,
     UNREADABLE,
     UNSTAMPED,
@@ -42,6 +47,7 @@ from calib_planner.acquisition import (
     StandstillSettings,
     StreamCount,
     mean_std,
+    points_in,
 )
 from calib_planner.arrays import IntArray, check_number, frozen
 from calib_planner.errors import FileFormatError, InputError, MissingExtraError
@@ -52,10 +58,6 @@ from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
 from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, cut, listed
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
-POINT = "geometry_msgs/msg/PointStamped"
-POINTS = (POINT, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped")
-"""Types of messages that hold a point: of poses and transforms it is the position."""
 WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
 REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
 REPORT_EVERY = 2000
@@ -147,9 +149,9 @@ def read_bag(
         raise FileFormatError(
             path, "bag", got, "an undamaged bag", "repair it, or accept it with --accept-damaged"
         )
-    _check_streams(path, streams, robot.joint_names)
+    _check_streams(path, bag.intake, robot.joint_names)
     if not standstills:
-        raise _no_standstill(path, bag.rejections, streams[0], settings)
+        raise _no_standstill(path, bag.rejections, streams[: len(topics.joints)], settings)
     q, points = np.array([s.joints for s in standstills]), np.array([s.points for s in standstills])
     data = Measurements(robot.joint_names, q, points, mean_std(standstills, sigma, repeatability))
     rejections = tuple(bag.rejections)
@@ -162,21 +164,23 @@ def _units(recording: Recording, robot: Robot, stated: Units) -> tuple[Units, tu
         return stated, ()
     joints, points = [np.zeros(len(robot.joint_names))], []
     number = {name: j for j, name in enumerate(robot.joint_names)}
+    first, targets = len(recording.topics.joints), len(recording.topics.points)
     with suppress(BrokenStorage):
-        for stream, data in islice(recording.messages(), LOOKED_AT):
-            message = recording.decode(stream, data)
-            if stream:
-                row = np.full((len(recording.names) - 1, 3), np.nan)
-                row[stream - 1] = message.point.x, message.point.y, message.point.z
-                points.append(row)
-            else:
+        for streams, data in islice(recording.messages(), LOOKED_AT):
+            message = recording.decode(streams[0], data)
+            if streams[0] < first:
                 q = np.zeros(len(number))
                 for name, value in zip(message.name, message.position, strict=False):
                     if name in number:
                         q[number[name]] = value
                 joints.append(q)
+            for target in (k - first for k in streams if first <= k < first + targets):
+                for p in recording.points(target, message):
+                    row = np.full((targets, 3), np.nan)
+                    row[target] = p.point.x, p.point.y, p.point.z
+                    points.append(row)
     angle, why = angles_by_size(robot, np.nan_to_num(joints), robot.joint_is_revolute)
-    metre, how = lengths_by_size(robot, np.array(points).reshape(len(points), len(recording.names) - 1, 3))
+    metre, how = lengths_by_size(robot, np.array(points).reshape(len(points), targets, 3))
     remarks = [*(() if stated.angle else why), *(() if stated.length else how)]
     return Units(stated.length or metre, stated.angle or angle), tuple(remarks)
 
@@ -184,34 +188,38 @@ def _units(recording: Recording, robot: Robot, stated: Units) -> tuple[Units, tu
 # ── what makes a bag unusable ────────────────────────────────────────────────────────────────────────
 
 
-def _check_streams(path: str | Path, streams: tuple[StreamCount, ...], joint_names: Sequence[str]) -> None:
-    for number, stream in enumerate(streams):
+def _check_streams(path: str | Path, intake: Intake, joint_names: Sequence[str]) -> None:
+    joints, points = intake.streams[: intake.joint_topics], intake.streams[intake.joint_topics :]
+    for stream in intake.streams:
         where = f"topic {stream.name}"
         if not stream.messages:
             raise FileFormatError(path, where, "no messages", "at least one standstill's", "was the driver on?")
-        if not stream.usable:
+        unheard = [n for n in joint_names if n in intake.unheard] if stream in joints else []
+        if unheard or not stream.usable:
             got = stream.describe().partition(": ")[2] + (f" ({stream.example})" if stream.example else "")
             advice = "check the driver and the line of sight"
             if stream.left_out.get(UNSTAMPED):
                 advice = "the driver has to fill header.stamp"
             elif stream.left_out.get(UNFIT):
-                advice = f"each message has to name and position {', '.join(joint_names)}"
-            wanted = "stamped, finite points" if number else "stamped, finite positions of the robot's joints"
-            raise FileFormatError(path, where, got, wanted, advice)
-    joints = streams[0]
-    for points in streams[1:]:
-        apart = max(points.first - joints.last, joints.first - points.last)
+                names = ", ".join(unheard or joint_names)
+                advice = f"name the topics that position {names}: one --joint-topic each"
+            wanted = "stamped, finite positions of the robot's joints"
+            raise FileFormatError(
+                path, where, got, wanted if stream in joints else "stamped, finite points", advice
+            )
+    for one, other in ((j, p) for p in points for j in joints):
+        apart = max(other.first - one.last, one.first - other.last)
         if apart > 0:
-            spans = (f"{s.name} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (joints, points))
+            spans = (f"{s.name} from {_seconds(s.first)} to {_seconds(s.last)}" for s in (one, other))
             got = " and ".join(spans)
             advice = "synchronise the clocks (PTP or NTP) and record again, or correct the stamps"
             raise FileFormatError(path, "header stamps", got, "streams that overlap in time", advice)
 
 
 def _no_standstill(
-    path: str | Path, rejections: list[Rejection], joints: StreamCount, settings: StandstillSettings
+    path: str | Path, rejections: list[Rejection], joints: Sequence[StreamCount], settings: StandstillSettings
 ) -> FileFormatError:
-    seconds = (joints.last - joints.first) / NANO
+    seconds = (max(j.last for j in joints) - min(j.first for j in joints)) / NANO
     got = f"none in {seconds:.1f} s"
     if rejections:
         got += "; " + "; ".join(_reasons(rejections))
@@ -246,9 +254,11 @@ class _BagIntake:
         self, path: str | Path, robot: Robot, topics: BagTopics, settings: StandstillSettings, units: Units
     ) -> None:
         self.path = path
-        self.intake = Intake(robot.joint_names, topics.names[0], topics.names[1:], settings)
-        self._metre = LENGTHS[units.length]
-        factors = np.where(robot.joint_is_revolute, ANGLES[units.angle], self._metre).tolist()
+        first = len(topics.joints)
+        joints, points = topics.names[:first], topics.names[first : first + len(topics.points)]
+        self.intake = Intake(robot.joint_names, joints, points, settings, topics.children)
+        self.intake.metre = LENGTHS[units.length]
+        factors = np.where(robot.joint_is_revolute, ANGLES[units.angle], LENGTHS[units.length]).tolist()
         self._factors = {n: f for n, f in zip(robot.joint_names, factors, strict=True) if f != 1.0}
         self.standstills: list[Standstill] = []
         self.rejections: list[Rejection] = []
@@ -259,8 +269,9 @@ class _BagIntake:
         """Read the whole recording; returns a description of the damage, which is empty if there is none."""
         total, done, stopped = max(sum(recording.promised), 1), 0, ""
         try:
-            for stream, data in recording.messages():
-                self._take(stream, recording, data)
+            for streams, data in recording.messages():
+                for stream in streams:
+                    self._take(stream, recording, data)
                 done += 1
                 if progress is not None and done % REPORT_EVERY == 0:
                     progress(min(done / total, 1.0), f"{len(self.standstills)} standstills")
@@ -268,43 +279,46 @@ class _BagIntake:
             stopped = f"unreadable after {done} messages: {error}"
         self._sort(self._detector.flush())
         damage = [recording.unread, stopped]
-        counts = zip(self.intake.streams, self._detector.dropped, recording.promised, strict=True)
-        for count, dropped, promised in counts:
+        for stream, (count, promised) in enumerate(zip(self.intake.streams, recording.promised, strict=False)):
             if count.messages < promised and not stopped:
                 damage.append(f"{promised - count.messages} of {promised} messages of {count.name} are missing")
             if count.left_out[UNREADABLE]:
                 unreadable = f"{count.left_out[UNREADABLE]} of {count.messages} messages"
                 damage.append(f"{unreadable} of {count.name} cannot be decoded ({count.example})")
-            count.left_out = +Counter({**count.left_out, DROPPED: dropped})
+            count.left_out = +Counter({**count.left_out, DROPPED: self.intake.dropped(stream)})
         return "; ".join(filter(None, damage))
 
     def _take(self, stream: int, recording: Recording, data: bytes) -> None:
+        intake, target = self.intake, stream - self.intake.joint_topics
         try:
             message = recording.decode(stream, data)
         except BrokenStorage as error:
-            count = self.intake.streams[stream]
+            count = intake.streams[min(stream, len(intake.streams) - 1)]
             count.messages += 1
             count.leave_out(UNREADABLE, str(error), str(error))
             return
-        if stream:
-            self._check_frame(message.header.frame_id)
-            if self._metre != 1.0:
-                x, y, z = (self._metre * v for v in (message.point.x, message.point.y, message.point.z))
-                message = SimpleNamespace(header=message.header, point=SimpleNamespace(x=x, y=y, z=z))
-            self._sort(self.intake.point(stream - 1, message))
-            return
+        if stream >= len(intake.streams):
+            intake.tracker_state(stream - len(intake.streams), bool(message.data))
+        elif target >= 0:
+            for point in recording.points(target, message):
+                self._sort(intake.point(target, point))
+                self._check_frame(intake.streams[stream])
+        else:
+            self._take_joints(stream, message)
+
+    def _take_joints(self, stream: int, message: Any) -> None:
         if self._factors and len(message.name) == len(message.position):
             q = [v * self._factors.get(n, 1.0) for n, v in zip(message.name, message.position, strict=True)]
             message = SimpleNamespace(header=message.header, name=message.name, position=q)
         with suppress(InputError):  # counted with its reason
-            self._sort(self.intake.joints(message))
+            self._sort(self.intake.joints(message, stream))
 
-    def _check_frame(self, frame: str) -> None:
+    def _check_frame(self, count: StreamCount) -> None:
         """A bag with points in two frames is refused as a whole: only its owner can say which frame is meant."""
-        if frame and self.intake.frame and frame != self.intake.frame:
-            got = f"{self.intake.frame!r} and {frame!r}"
-            advice = "transform the points, or split the bag where the station changed"
-            raise FileFormatError(self.path, "frame_id of the points", got, "one frame", advice)
+        if count.left_out[OTHER_FRAME]:
+            advice = "transform the points, split the bag where the station changed, or name the --child-frame"
+            got = count.reason.partition(": ")[0]
+            raise FileFormatError(self.path, f"frames of {count.name}", got, "one frame", advice)
 
     def _sort(self, results: list[Standstill | Rejection]) -> None:
         for result in results:
@@ -326,25 +340,33 @@ class Recording:
     """An open bag.
 
     Attributes:
-        names: The topics wanted, as in the bag; their positions are the numbers of the streams.
+        topics: The topics wanted; the position of one in their ``names`` is the number of its stream.
         promised: Messages of each topic, as the bag's own index says.
         kinds: Types of their messages.
         unread: What the bag holds but no reader gets at, in words; empty if there is nothing.
     """
 
-    names: tuple[str, ...]
+    topics: BagTopics
     promised: tuple[int, ...]
     kinds: tuple[str, ...]
     unread: str
     _readers: tuple[Any, ...]
     _types: Any
 
-    def messages(self) -> Iterator[tuple[int, bytes]]:
-        """Number of the stream and undecoded message, in the order of recording.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The topics wanted, as in the bag."""
+        return self.topics.names
+
+    def messages(self) -> Iterator[tuple[tuple[int, ...], bytes]]:
+        """Numbers of the streams and undecoded message, in the order of recording.
+
+        A topic with transforms of several targets is a stream of each.
 
         Raises:
             BrokenStorage: The storage is damaged here; nothing more can be read.
         """
+        streams = {name: tuple(k for k, n in enumerate(self.names) if n == name) for name in self.names}
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in self.names]
             source = iter(reader.messages(wanted)) if wanted else iter(())
@@ -355,23 +377,23 @@ class Recording:
                     break
                 except Exception as error:  # rosbags lets through what sqlite, zstd, lz4 and struct raise
                     raise BrokenStorage(reason(error)) from None
-                yield self.names.index(connection.topic), data
+                yield streams[connection.topic], data
 
     def decode(self, stream: int, data: bytes) -> Any:
-        """The message as an object with the fields of JointState or PointStamped.
+        """The message as an object with the fields of its type.
 
         Raises:
             BrokenStorage: These bytes are no such message.
         """
         try:
-            message = self._types.deserialize_cdr(data, self.kinds[stream])
+            return self._types.deserialize_cdr(data, self.kinds[stream])
         except Exception as error:
             raise BrokenStorage(reason(error)) from None
-        if not stream or self.kinds[stream] == POINT:
-            return message
-        pose = self.kinds[stream] == POINTS[1]
-        point = message.pose.position if pose else message.transform.translation
-        return SimpleNamespace(header=message.header, point=point)
+
+    def points(self, target: int, message: Any) -> list[Any]:
+        """The points of a target, from 0, in a message of its stream."""
+        child = self.topics.children[target] if self.topics.children else ""
+        return points_in(self.kinds[len(self.topics.joints) + target], message, child)
 
 
 @contextmanager
@@ -390,11 +412,11 @@ def open_bag(path: str | Path, topics: BagTopics) -> Iterator[Recording]:
                 readers.append(stack.enter_context(reader_class(part)))
             except Exception as error:
                 raise FileFormatError(part, "bag", reason(error), WHAT, REPAIR) from None
-        kinds = _kinds(path, readers, topics.names)
+        kinds = _kinds(path, readers, topics)
         promised = tuple(
             sum(c.msgcount for r in readers for c in r.connections if c.topic == name) for name in topics.names
         )
-        yield Recording(topics.names, promised, kinds, _write_ahead(path), tuple(readers), types)
+        yield Recording(topics, promised, kinds, _write_ahead(path), tuple(readers), types)
 
 
 def storage_parts(path: str | Path) -> list[Path]:
@@ -440,14 +462,15 @@ def _rosbags() -> tuple[Any, Any]:
     return Reader, get_typestore(Stores.ROS2_JAZZY)
 
 
-def _kinds(path: str | Path, readers: list[Any], names: tuple[str, ...]) -> tuple[str, ...]:
+def _kinds(path: str | Path, readers: list[Any], topics: BagTopics) -> tuple[str, ...]:
     """The type of each topic's messages, which has to be one that holds what is needed."""
     types_of: dict[str, set[str]] = {}
     for connection in (c for r in readers for c in r.connections):
         types_of.setdefault(connection.topic, set()).add(connection.msgtype)
     described = _list([f"{t} ({', '.join(sorted(types_of[t]))})" for t in sorted(types_of)])
-    for stream, name in enumerate(names):
-        valid, option = (POINTS, "--point-topic") if stream else ((JOINT_STATE,), "--joint-topic")
+    names, wants = topics.names, [(JOINT_STATE,)] * len(topics.joints) + [tuple(POINTS)] * len(topics.points)
+    for name, valid in zip(names, wants + [(STATE,)] * len(topics.states), strict=True):
+        option = {JOINT_STATE: "--joint-topic", STATE: "--state-topic"}.get(valid[0], "--point-topic")
         fitting = [t for t in sorted(types_of) if len(types_of[t]) == 1 and types_of[t] <= {*valid}]
         wanted = " or ".join(valid)
         close = (get_close_matches(name, fitting, n=1, cutoff=0.3) or fitting)[:1]
@@ -457,7 +480,13 @@ def _kinds(path: str | Path, readers: list[Any], names: tuple[str, ...]) -> tupl
             raise FileFormatError(path, f"topic {name}", got, f"messages of {wanted}", advice)
         if name not in fitting:
             raise FileFormatError(path, f"topic {name}", ", ".join(sorted(types_of[name])), wanted, advice)
-    return tuple(next(iter(types_of[name])) for name in names)
+    kinds = tuple(next(iter(types_of[name])) for name in names)
+    if TRANSFORMS in kinds and not topics.children:
+        where, advice = f"topic {names[kinds.index(TRANSFORMS)]}", "name one per target with --child-frame"
+        raise FileFormatError(
+            path, where, "transforms of many frames", "the child_frame_id of the target", advice
+        )
+    return kinds
 
 
 def _write_ahead(path: str | Path) -> str:

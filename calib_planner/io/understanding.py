@@ -27,7 +27,7 @@ from calib_planner.io.sizes import angles_by_size, lengths_by_size, sliding_by_s
 from calib_planner.io.table import SEPARATORS, Table, separator_named
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, counted
+from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, counted, listed
 
 STORAGE = (".db3", ".mcap")
 """Endings of the storage files of a bag."""
@@ -47,25 +47,43 @@ class BagTopics:
     """Where the messages are; a leading slash may be left out.
 
     Attributes:
-        joints: Topic of sensor_msgs/JointState.
-        points: Topics of geometry_msgs/PointStamped, PoseStamped or TransformStamped, one per target, in their
-            order.
+        joints: Topics of sensor_msgs/JointState: one, or several that hold some of the joints each.
+        points: Topics of geometry_msgs/PointStamped, PoseStamped or TransformStamped, or of tf2_msgs/TFMessage,
+            one per target, in their order.
+        children: The child_frame_id of each target, for transforms; empty: the first one that comes.
+        states: Topics of std_msgs/Bool on which the tracker says whether it sees each target; empty: none.
     """
 
-    joints: str = "joint_states"
+    joints: tuple[str, ...] = ("joint_states",)
     points: tuple[str, ...] = ("tracker/point",)
+    children: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", tuple(self.points))
+        if isinstance(self.joints, str):
+            object.__setattr__(self, "joints", (self.joints,))
+        for name in ("joints", "points", "children", "states"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         names = self.names
-        if len(names) < 2 or "/" in names or len(set(names)) != len(names):
-            got = ", ".join(map(repr, (self.joints, *self.points)))
-            raise InputError("topics", got, "a topic of joints and one per target, each once")
+        shared = len(set(self.children)) == len(self.points)  # transforms of several targets on one topic
+        apart = (*self.joints, *(set(self.points) if shared else self.points), *self.states)
+        if not (self.joints and self.points) or "/" in names or len(set(map(_absolute, apart))) != len(apart):
+            got = ", ".join(map(repr, (*self.joints, *self.points, *self.states)))
+            raise InputError("topics", got, "topics of joints and one per target, each once")
+        for name in ("children", "states"):
+            if len(getattr(self, name)) not in (0, len(self.points)):
+                raise InputError(
+                    name, listed(getattr(self, name)), f"{len(self.points)}, one per target, or none"
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All topics as a bag names them, that of the joints first."""
-        return tuple("/" + name.strip().strip("/") for name in (self.joints, *self.points))
+        """All topics as a bag names them: those of the joints, of the points, of the states."""
+        return tuple(map(_absolute, (*self.joints, *self.points, *self.states)))
+
+
+def _absolute(name: str) -> str:
+    return "/" + name.strip().strip("/")
 
 
 @dataclass(frozen=True)

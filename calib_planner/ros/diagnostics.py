@@ -55,7 +55,8 @@ class StreamHealth:
 
 def health(intake: Intake, now: int, seconds: float) -> list[StreamHealth]:
     """Every stream of ``intake`` in the last ``seconds``, at the time ``now`` [ns]."""
-    detector, joints = intake.detector, intake.streams[0].last
+    detector, first = intake.detector, intake.joint_topics
+    joints = max(count.last for count in intake.streams[:first])
     return [
         StreamHealth(
             name=count.name,
@@ -64,10 +65,10 @@ def health(intake: Intake, now: int, seconds: float) -> list[StreamHealth]:
             skew=(joints - count.last) / NANO if count.last and joints else None,
             messages=count.messages,
             refused=count.refused,
-            late=0 if detector is None else detector.dropped[k],
+            late=intake.dropped(k),
             lost=count.lost,
             reason=count.reason,
-            offset=None if detector is None or k == 0 else detector.clocks.offset(k - 1),
+            offset=None if detector is None or k < first else detector.clocks.offset(k - first),
         )
         for k, count in enumerate(intake.streams)
     ]

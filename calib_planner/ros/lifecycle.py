@@ -140,6 +140,15 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         """In ``configure`` or ``activate``: call ``callback(*args)`` on the way back, the last one first."""
         self._made[-1].callback(callback, *args)
 
+    @contextmanager
+    def as_configured(self) -> Iterator[None]:
+        """What is made in this context stays until ``clean_up``, as if ``configure`` had made it."""
+        later, self._made = self._made[1:], self._made[:1]
+        try:
+            yield
+        finally:
+            self._made += later
+
     @property
     def is_active(self) -> bool:
         """Whether the state is *active*."""
@@ -223,7 +232,8 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             getattr(self, hook)()
         except Exception as error:
             self.failure = reason_of(error)
-            self.get_logger().error(f"cannot {hook}: {self.failure}")
+            if self.context.ok():  # else the process is ending, which is no fault
+                self.get_logger().error(f"cannot {hook}: {self.failure}")
             self._attempt(self._made.pop().close)
             return FAILURE
         return SUCCESS
@@ -245,7 +255,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
             self._first = None
         if self.state == "unconfigured" and self.trigger_configure() == SUCCESS:
             self.trigger_activate()
-        if self.failure:
+        if self.failure and self.context.ok():
             name = self.get_fully_qualified_name()
             advice = f"remedy it, then: ros2 lifecycle set {name} configure, and activate"
             self.get_logger().error(f"not started; {advice}")

@@ -72,7 +72,11 @@ PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency")
 PURPOSE = {FIT: PlanMessage.FIT, VALIDATION: PlanMessage.VALIDATION}
 LEVELS = {"PASS": VerdictMessage.PASS, "WARN": VerdictMessage.WARN, "FAIL": VerdictMessage.FAIL}
 MEASUREMENT_STATUS = {
-    word: getattr(Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}")
+    word: getattr(
+        Measurement,
+        word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}",
+        Measurement.REJECTED_NOT_FINITE,
+    )
     for word in DECISIONS
 }
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import pkgutil
 import runpy
 import signal
 import socket
@@ -27,6 +28,8 @@ from pathlib import Path
 from types import TracebackType
 
 from calib_planner.errors import CalibPlannerError
+from calib_planner.ros import nodes as nodes_folder
+from calib_planner.ros.nodes import end_quietly
 
 PATIENCE = 8.0
 """Time that a node has to end by itself before it is killed [s]."""
@@ -215,8 +218,9 @@ def _undisturbed() -> Iterator[None]:
 
 
 def node_names() -> Sequence[str]:
-    """Executables of all nodes of this package."""
-    return ("planner_node", "identifier_node", "simulator_node", "campaign_node")
+    """Executables of all nodes of this package, sorted."""
+    names = (module.name for module in pkgutil.iter_modules(nodes_folder.__path__))
+    return tuple(f"{name}_node" for name in sorted(names))
 
 
 # ── inside the process of a node ─────────────────────────────────────────────────────────────────────
@@ -239,6 +243,7 @@ def main() -> None:
     """Run the node of the executable ``NAME_node`` (``nodes/NAME.py``) with what follows on the command line."""
     if len(sys.argv) < 2 or not sys.argv[1].isidentifier():
         raise SystemExit("usage: python -m calib_planner.ros.processes NAME_node [--ros-args …]")
+    end_quietly()
     end_with_parent()
     node = sys.argv.pop(1).removesuffix("_node")
     runpy.run_module(f"calib_planner.ros.nodes.{node}", run_name="__main__", alter_sys=True)

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.acquisition import StandstillSettings
+from calib_planner.acquisition import POINTS, StandstillSettings
 from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.io import config_folder
+from calib_planner.io import BagTopics, config_folder
 from calib_planner.planning import CRITERIA
 from calib_planner.ros.execution import Watch
 from calib_planner.ros.lifecycle import LifecycleParameters
@@ -129,7 +129,19 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
     error_model: str = at_configure("typical", ERROR_MODEL)
     accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
     frame_id: str = parameter("base_link", BASE_FRAME)
+    joint_topics: tuple[str, ...] = at_configure(
+        ("joint_states",), "topics of the joint states: one, or several with some of the joints each"
+    )
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
+    tracker_type: str = at_configure(
+        "", "type of the messages on tracker_topics; empty = that of their publishers", choices=("", *POINTS)
+    )
+    tracker_child_frames: tuple[str, ...] = at_configure(
+        ("",), "child_frame_id of each target, where transforms are published; empty = the first one that comes"
+    )
+    tracker_state_topics: tuple[str, ...] = at_configure(
+        ("",), "topics of std_msgs/Bool, one per target: whether the tracker sees it; empty = none"
+    )
     plan_topic: str = at_configure("calibration_planner/current_plan", "topic of the plan")
     plan_tolerance: float = parameter(
         0.01, "largest joint difference to a planned configuration", "rad or m", 1e-6, 1.0
@@ -159,6 +171,15 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
         super().__post_init__()
         if not self.tracker_topics or not all(self.tracker_topics):
             raise InputError("tracker_topics", self.tracker_topics, "one topic name per target")
+        _ = self.topics
+
+    @property
+    def topics(self) -> BagTopics:
+        """The topics of the drivers; the same rules hold for those of a node and of a bag."""
+        children, states = (
+            tuple(filter(None, t)) for t in (self.tracker_child_frames, self.tracker_state_topics)
+        )
+        return BagTopics(self.joint_topics, self.tracker_topics, children, states)
 
 
 @dataclass(frozen=True)
@@ -336,7 +357,7 @@ def _yaml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return "[" + ", ".join(value) + "]"
+        return "[" + ", ".join(text or '""' for text in value) + "]"
     if isinstance(value, str):
         return f'"{value}"'
     if isinstance(value, float):

@@ -248,7 +248,7 @@ def test_memory_is_bounded() -> None:
     detector = StandstillDetector(2, 1, settings)
     for i in range(30_000):
         detector.add_joints(i * 1_000_000, np.zeros(2))
-    assert len(detector._joints.samples) < 3000
+    assert len(detector._joints.parts[0].window.samples) < 3000
     assert len(detector._order._heap) < 2000
 
 

@@ -20,6 +20,7 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 T: Any = TYPES.types
 JOINTS, POINT = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PointStamped"
 POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
+TRANSFORMS, STATE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/Bool"
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,18 +62,26 @@ def campaign(
 
 
 def message(said: Said) -> Any:
-    """The ROS message; ``extra`` may set ``frame_id``, and the ``kind`` of a point."""
+    """The ROS message; ``extra`` may set ``frame_id``, ``kind`` of streams from 1, ``child`` of transforms."""
     time = T["builtin_interfaces/msg/Time"](sec=said.stamp // NANO, nanosec=said.stamp % NANO)
     header = T["std_msgs/msg/Header"](stamp=time, frame_id=said.extra.get("frame_id", "tracker"))
     kind = said.extra.get("kind", POINT)
+    if kind == STATE:
+        return T[STATE](bool(said.values[0]))
     xyz, turned = [float(v) for v in said.values[:3]], T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.6, 0.8)
     if said.stream and kind == POSE:
         pose = T["geometry_msgs/msg/Pose"](T["geometry_msgs/msg/Point"](*xyz), turned)
         return T[POSE](header, pose)
-    if said.stream and kind == TRANSFORM:
-        transform = T["geometry_msgs/msg/Transform"](T["geometry_msgs/msg/Vector3"](*xyz), turned)
-        return T[TRANSFORM](header, "reflector", transform)
-    if said.stream:
+    if said.stream and kind in (TRANSFORM, TRANSFORMS):
+        at = T["geometry_msgs/msg/Vector3"]
+        one = T[TRANSFORM](
+            header, said.extra.get("child", "reflector"), T["geometry_msgs/msg/Transform"](at(*xyz), turned)
+        )
+        if kind == TRANSFORM:
+            return one
+        away = T["geometry_msgs/msg/Transform"](at(1.0, 2.0, 3.0), turned)
+        return T[TRANSFORMS]([T[TRANSFORM](header, "other", away), one])
+    if said.stream and kind != JOINTS:
         return T[POINT](header=header, point=T["geometry_msgs/msg/Point"](*map(float, said.values)))
     none, position = np.empty(0), np.asarray(said.values, float)
     return T[JOINTS](header, list(said.names), position, said.extra.get("velocity", none), none)

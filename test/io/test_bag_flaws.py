@@ -76,7 +76,7 @@ FLAWS: dict[str, tuple[dict, BagTopics, list[str]]] = {
     "two frames": (
         {"said": [replace(m, extra={"frame_id": f"station_{i > 900}"}) for i, m in enumerate(SAID)]},
         BagTopics(),
-        ["frame_id", "'station_False' and 'station_True'", "one frame"],
+        ["frame_id 'station_True'", "are in 'station_False'", "one frame"],
     ),
     "never at rest": (
         {"said": [m if m.stream else replace(m, values=m.values + m.stamp % 97 * 1e-4) for m in SAID]},

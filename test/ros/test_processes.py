@@ -11,10 +11,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
+from robots import repeats
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.ros import processes
@@ -84,6 +86,59 @@ def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -
         assert "Traceback" not in log.read_text(), log.read_text()
 
 
+INTERRUPTED = """
+import os, signal, sys
+
+class Interrupting:
+    left = int(sys.argv[1])
+
+    def find_spec(self, *others):
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+name = sys.argv[2]
+sys.argv = [f"/somewhere/{name}_node"]
+from importlib import import_module  # as the script that starts a node
+sys.meta_path.insert(0, Interrupting())
+import_module(f"calib_planner.ros.nodes.{name}").main()
+"""
+"""Starts a node, and sends SIGINT to itself as the n-th module is searched."""
+
+
+@pytest.mark.parametrize("name", [name.removesuffix("_node") for name in node_names()])
+@pytest.mark.parametrize("seed", repeats(range(1), range(15)))
+def test_ctrl_c_while_modules_are_imported_ends_a_node_without_a_word(name: str, seed: int) -> None:
+    searched = 4 + int(np.random.default_rng(seed + 100 * len(name)).integers(300))
+    command = [sys.executable, "-c", INTERRUPTED, str(searched), name]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, "", ""), searched
+
+
+@pytest.mark.parametrize("seed", repeats(range(1), range(10)))
+def test_ctrl_c_several_times_ends_all_nodes_with_status_0(tmp_path: Path, seed: int) -> None:
+    """A terminal tells all of its processes, ``ros2 launch`` tells them again, and people do."""
+    draw = np.random.default_rng(seed)
+    names = node_names()
+    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+        for name in names:
+            nodes.start(name)
+        logs = {name: tmp_path / f"{name}.log" for name in names}
+        assert wait(lambda: all(log.stat().st_size for log in logs.values()))
+        nodes.check()
+        again = [(float(t), name) for name in names for t in draw.uniform(0.0, 0.5, draw.integers(1, 4))]
+        began = time.monotonic()
+        for name in names:
+            os.kill(nodes.processes[name], signal.SIGINT)
+        for instant, name in sorted(again):
+            time.sleep(max(0.0, began + instant - time.monotonic()))  # the instants are what is tried
+            if running(nodes.processes[name]):
+                os.kill(nodes.processes[name], signal.SIGINT)
+        assert nodes.end(signal.SIGINT) == dict.fromkeys(names, 0), nodes.logs()
+    for log in logs.values():
+        assert "Traceback" not in log.read_text() and "[ERROR]" not in log.read_text(), log.read_text()
+
+
 def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         log = tmp_path / "simulator_node.log"
@@ -114,11 +169,6 @@ def test_a_module_that_is_none_is_refused() -> None:
     command = [sys.executable, "-m", "calib_planner.ros.processes", "../planner_node"]
     ended = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert ended.returncode == 1 and "usage" in ended.stderr and "Traceback" not in ended.stderr
-
-
-def test_all_nodes_are_named() -> None:
-    here = Path(processes.__file__).parent
-    assert sorted(node_names()) == sorted(f"{path.stem}_node" for path in (here / "nodes").glob("[a-z]*.py"))
 
 
 def test_a_domain_is_given_to_one_at_a_time_and_only_if_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> None:

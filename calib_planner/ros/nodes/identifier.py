@@ -13,20 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import UndoMeasurement
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from calib_planner import __version__
-from calib_planner.acquisition import Intake, Rejection, Standstill
+from calib_planner.acquisition import Intake, PointLike, Rejection, Standstill
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.identification import Estimate
 from calib_planner.io import (
@@ -53,14 +51,12 @@ from calib_planner.ros.messages import (
     stamp_message,
 )
 from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
-from calib_planner.ros.parameters import EVENTS, LATCHED, STREAM_IN
-from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.session import Matching, Session, TooFew, condition_of
 from calib_planner.ros.settings import IdentifierParameters
+from calib_planner.ros.streams import DriverStreams, Listener
 from calib_planner.units import brief, cut
-
-JOINTS = "joint_states"
 
 
 class IdentifierOutput:
@@ -144,16 +140,14 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             self.get_logger().warning(text)
         self._error_model = read_error_model(chosen.error_model)
         self._output = IdentifierOutput(self)
+        self._locked: dict[int, bool] = {}  # target → whether the tracker sees it, as far as it said
         self.undo_with(self._leave_session)
         self._begin_with_stored()
         self.create_subscription(PlanMessage, chosen.plan_topic, self._on_plan, LATCHED)
         if chosen.use_robot_description:
             self.create_subscription(String, TOPIC, self._on_description, LATCHED)
-        streams = [Stream(JointState, JOINTS, self._on_joints, partial(self._on_lost, 0))]
-        for k, topic in enumerate(chosen.tracker_topics):
-            hear, lost = partial(self._on_point, k), partial(self._on_lost, 1 + k)
-            streams.append(Stream(PointStamped, topic, hear, lost))
-        StreamPoller(self, streams, STREAM_IN)
+        hears = Listener(self._on_joints, self._on_point, self._on_state, self._on_lost)
+        self._streams = DriverStreams(self, chosen.topics, chosen.tracker_type, hears)
         for name in ("reset", "undo", "save", "report"):
             self.create_trigger(f"~/{name}", getattr(self, f"_{name}"))
         self.create_service(UndoMeasurement, "~/undo_measurement", self._on_undo)
@@ -162,7 +156,10 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         """Take the messages of the streams."""
         chosen = self.settings.value
         joint_names = None if self._session is None else self._session.nominal.joint_names
-        self._intake = Intake(joint_names, JOINTS, chosen.tracker_topics, chosen)
+        topics = chosen.topics
+        self._intake = Intake(joint_names, topics.joints, topics.points, chosen, topics.children)
+        for target, locked in self._locked.items():
+            self._intake.tracker_state(target, locked)
         self._keep_frame()
         self.create_steady_timer(chosen.diagnostics_period, self._tick)
         self._update()
@@ -268,20 +265,29 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
     def _refuse_plan(self, plan_id: str, error: CalibPlannerError) -> None:
         self.get_logger().error(f"plan {brief(plan_id, 40)} refused: {cut(error)}", throttle_duration_sec=1.0)
 
-    def _on_joints(self, message: JointState) -> None:
+    def _on_joints(self, topic: int, message: JointState) -> None:
         if self._intake is None:
             return
         try:
-            results = self._intake.joints(message)
+            results = self._intake.joints(message, topic)
         except InputError as error:
-            self.get_logger().warning(f"{JOINTS}: {cut(error)}", throttle_duration_sec=5.0)
+            name = self.settings.value.joint_topics[topic]
+            self.get_logger().warning(f"{name}: {cut(error)}", throttle_duration_sec=5.0)
             return
         if results:
             self._handle(results)
 
-    def _on_point(self, target: int, message: PointStamped) -> None:
+    def _on_point(self, target: int, message: PointLike) -> None:
         if self._intake is not None and (results := self._intake.point(target, message)):
             self._handle(results)
+
+    def _on_state(self, target: int, locked: bool) -> None:
+        if self._locked.get(target, True) != locked:
+            words = "sees target" if locked else "has lost target"
+            self.get_logger().info(f"the tracker {words} {target + 1}")
+        self._locked[target] = locked
+        if self._intake is not None:
+            self._intake.tracker_state(target, locked)
 
     def _on_lost(self, stream: int, count: int) -> None:
         if self._intake is not None:
@@ -352,6 +358,9 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             self._reopen()
         self._withdraw_misdated()
         if intake is not None:
+            for target, trouble in enumerate(self._streams.trouble):
+                count = intake.streams[intake.joint_topics + target]
+                count.reason = trouble or count.reason
             now = self.now
             streams = health(intake, now, chosen.diagnostics_period)
             name = self.get_fully_qualified_name().strip("/")

@@ -29,6 +29,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
+from calib_planner.acquisition import stamp_of
+
 PERIOD = 0.01
 """Time between two looks at the streams [s]."""
 EVENTS_EVERY = 100
@@ -36,8 +38,8 @@ EVENTS_EVERY = 100
 MOST_AT_ONCE = 1000
 """Messages of one stream that are fetched at a time; the others wait in its queue for the next look."""
 
-Waiting = tuple[Any, Callable[[Any], None]]
-"""A message and the callback that takes it."""
+Waiting = tuple[int, Any, Callable[[Any], None]]
+"""The stamp of a message [ns], the message, and the callback that takes it."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +47,18 @@ class Stream:
     """A topic to listen to.
 
     Attributes:
-        kind: Type of its messages, which have a header.
+        kind: Type of its messages.
         topic: Name of the topic.
         callback: Takes a message.
         lost: Takes the number of messages that were not delivered.
+        stamp: Gives the stamp of a message [ns]; by default that in its header.
     """
 
     kind: type
     topic: str
     callback: Callable[[Any], None]
     lost: Callable[[int], None]
+    stamp: Callable[[Any], int] = stamp_of
 
 
 class StreamPoller:
@@ -67,15 +71,26 @@ class StreamPoller:
     """
 
     def __init__(self, node: Node, streams: Sequence[Stream], qos: QoSProfile) -> None:
-        self._looks, self._group = 0, _Unwoken()
-        self._subscriptions = [self._subscribe(node, stream, qos) for stream in streams]
+        self._node, self._qos, self._looks, self._group = node, qos, 0, _Unwoken()
+        self._streams = list(streams)
+        self._subscriptions = [self._subscribe(stream) for stream in streams]
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
         node.create_timer(PERIOD, self.poll, clock=steady)
 
-    def _subscribe(self, node: Node, stream: Stream, qos: QoSProfile) -> Subscription:
+    def _subscribe(self, stream: Stream) -> Subscription:
         events = SubscriptionEventCallbacks(message_lost=lambda event: stream.lost(event.total_count_change))
         options = {"callback_group": self._group, "event_callbacks": events}
-        return node.create_subscription(stream.kind, stream.topic, stream.callback, qos, **options)
+        return self._node.create_subscription(stream.kind, stream.topic, stream.callback, self._qos, **options)
+
+    def topic(self, number: int) -> str:
+        """Full name of the topic of a stream, from 0, as remapped."""
+        return str(self._subscriptions[number].topic_name)
+
+    def change(self, number: int, stream: Stream) -> None:
+        """Listen to another type of messages in place of stream ``number``, from 0."""
+        self._node.destroy_subscription(self._subscriptions[number])
+        self._streams[number] = stream
+        self._subscriptions[number] = self._subscribe(stream)
 
     def poll(self) -> None:
         """Hand out all that has come, in the order of the stamps."""
@@ -85,12 +100,13 @@ class StreamPoller:
 
     def fetch(self) -> list[Waiting]:
         """What has come, stream by stream."""
-        return [(m, s.callback) for s in self._subscriptions for m in _fetched(s)]
+        pairs = zip(self._streams, self._subscriptions, strict=True)
+        return [(stream.stamp(m), m, made.callback) for stream, made in pairs for m in _fetched(made)]
 
     @staticmethod
     def hand_out(waiting: list[Waiting]) -> None:
         """Call back in the order of the stamps."""
-        for message, callback in sorted(waiting, key=_stamp):
+        for _, message, callback in sorted(waiting, key=lambda w: w[0]):
             callback(message)
 
 
@@ -109,11 +125,6 @@ class _Unwoken(CallbackGroup):
 
     def ending_execution(self, entity: object) -> None:
         return
-
-
-def _stamp(waiting: Waiting) -> tuple[int, int]:
-    stamp = waiting[0].header.stamp
-    return stamp.sec, stamp.nanosec
 
 
 def _fetched(subscription: Subscription) -> list[Any]:

@@ -7,8 +7,9 @@ threads, one may destroy a publisher (transition ``cleanup``) just when another 
 executor then raises ``InvalidHandle``, although it works again at the next call.
 
 *What is done here.* rclpy's handlers are not installed. A thread of its own waits for signals and wakes the
-executor, which looks whether the process is to end before it sleeps again. ``InvalidHandle`` while collecting is
-passed over.
+executor, which looks whether the process is to end before it sleeps again. Once it ends, further signals are
+ignored: Ctrl-C in a terminal reaches a node twice when ``ros2 launch`` passes it on, too. ``InvalidHandle`` while
+collecting is passed over.
 
 *Upstream.* ros2/rclpy#844 (shutdown by a signal), #1142 and #1206 (``InvalidHandle``, open). This file may go
 when rclpy's handlers leave the context alone until the executor has returned, and when the executor passes over
@@ -78,6 +79,7 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
             return 0
         raise
     finally:
+        ended.is_heard()
         close = getattr(node, "close", None)
         in_time = close() if close is not None else True
         if ended.executor is not None:
@@ -103,6 +105,12 @@ class Ended:
             signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(self._write.fileno(), warn_on_full_buffer=False)
         threading.Thread(target=self._wait, daemon=True, name="signals").start()
+
+    def is_heard(self) -> None:
+        """From now on both are ignored: the process ends, whether it is told once more or not."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        signal.set_wakeup_fd(-1)
 
     def _wait(self) -> None:
         while number := self._read.recv(1):
