@@ -19,7 +19,7 @@ def end_quietly() -> None:
 
 
 def _is_node(program: str) -> bool:
-    """Whether a program (``sys.argv[0]``) is a node; ``-m`` is ``python -m`` while it imports the module's folder."""
+    """Whether a program (``sys.argv[0]``) is a node; ``-m`` while ``python -m`` imports its folder."""
     name = Path(program).name
     file = Path(__file__).parent / f"{name.removesuffix('_node')}.py"
     return program == "-m" or (name.endswith("_node") and file.is_file())
