@@ -217,7 +217,6 @@ class StandstillDetector:
         if any(self._order.newest(p.columns[0]) is not None for p in divided):
             self._order.clear()  # states of the whole part may be waiting
             self._waiting.clear()
-            self._measured = None
             self._joints.begin()
         self._arrange()
         row = {column: k for k, column in enumerate(columns)}

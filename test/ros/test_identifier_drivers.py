@@ -21,9 +21,14 @@ from std_msgs.msg import Bool, String
 from test_identifier_node import Shift, spread
 
 from calib_planner import Plan, Robot
+from calib_planner.acquisition import NANO, TRANSFORMS
 from calib_planner.errors import CalibPlannerError
+from calib_planner.io import BagTopics
+from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
+from calib_planner.ros.messages import point_message
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.parameters import EVENTS, SENSOR_OUT
+from calib_planner.ros.streams import DriverStreams, Listener
 
 POSE = "geometry_msgs/msg/PoseStamped"
 BEST_EFFORT = QoSProfile(depth=500, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -148,23 +153,34 @@ def test_a_type_that_is_stated_is_listened_to_whatever_is_published(bench: Bench
     assert node._streams.kinds == [POSE]
 
 
-def test_a_target_is_found_among_all_transforms(bench: Bench, driver: Node, robot: Robot, planned: Plan) -> None:
+class Ears(ManagedNode[LifecycleParameters]):
+    """Listens to the transforms to the frame ``ball`` on the topic tf."""
+
+    def __init__(self, **options: Any) -> None:
+        self.heard: list[Any] = []
+        super().__init__("ears", LifecycleParameters(), **options)
+
+    def configure(self) -> None:
+        def nothing(*_: Any) -> None:
+            return
+
+        listener = Listener(nothing, lambda target, point: self.heard.append((target, point)), nothing, nothing)
+        DriverStreams(self, BagTopics(points=("tf",), children=("ball",)), TRANSFORMS, listener)
+
+
+def test_a_target_is_found_among_all_transforms(bench: Bench, driver: Node) -> None:
     tf2 = pytest.importorskip("tf2_msgs.msg")
-
-    class Tf(Drivers):
-        def change(self, publisher: Any, message: Any) -> list[tuple[Any, Any]]:
-            if isinstance(message, JointState):
-                return [(publisher, message)]
-            others = [transformed(PointStamped(header=message.header), child) for child in ("link_1", "head")]
-            return [(tf, tf2.TFMessage(transforms=[*others, transformed(message)]))]
-
+    ears = bench.start(Ears)
     tf = driver.create_publisher(tf2.TFMessage, "tf", SENSOR_OUT)
-    named = {"tracker_topics": ["tf"], "tracker_type": "tf2_msgs/msg/TFMessage"}
-    shift = Tf(bench, robot, tracker_child_frames=["ball"], **named)
     bench.wait(tf.get_subscription_count)
-    shift.announce(planned)
-    found = shift.rest(planned.configurations[0])
-    assert found.status == Measurement.ACCEPTED, found.reason
+    for k in range(3):
+        point = point_message(np.full(3, float(k)), (1 + k) * NANO, "laser")
+        tf.publish(tf2.TFMessage(transforms=[transformed(point, child) for child in ("link_1", "ball", "head")]))
+        tf.publish(tf2.TFMessage())
+    bench.wait(lambda: len(ears.heard) == 3)
+    assert [(target, p.child_frame_id, p.point.y) for target, p in ears.heard] == [
+        (0, "ball", k) for k in range(3)
+    ]
 
 
 def test_transforms_without_the_name_of_the_target_are_refused(bench: Bench) -> None:
