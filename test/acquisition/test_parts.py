@@ -1,8 +1,8 @@
 """Joints in parts, a rail and an arm: a standstill that is long enough is accepted, and a motion is not.
 
 As ``test_standstill_rates.py``, whose lever now stands on a rail: the rail and the arm have messages of their
-own, at rates from 5 Hz to 1 kHz that have nothing to do with one another, and arrive late each in its own way. At a
-stop both may have moved, or only one of them. Long enough is what is so for the slower part.
+own, at rates from 5 Hz to 1 kHz that have nothing to do with one another, and arrive late each in its own way. At
+a stop both may have moved, or only one of them. Long enough is what is so for the slower part.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def test_a_motion_is_never_accepted(case: Parts, frozen: tuple[int, ...]) -> Non
 
 
 def standing(detector: StandstillDetector, seconds: float, begin: float = 0.0, **rates: int) -> Results:
-    """Three joints at 1, 2, 3 and a point at rest from ``begin`` on; ``rates`` of joints named a, b and c [Hz]."""
+    """Three joints at 1, 2, 3 and a point at rest from ``begin`` on; ``rates`` of joints a, b and c [Hz]."""
     results, sent = [], []
     for letters, rate in ({"p": 50} | rates).items():
         sent += [(begin + (k + 0.01 * len(letters)) / rate, letters) for k in range(int(seconds * rate))]
@@ -213,7 +213,7 @@ def test_columns_that_do_not_fit_are_refused(columns: tuple[int, ...]) -> None:
 
 
 def lost_between(begin: float, end: float, seconds: float = 3.0) -> Results:
-    """A robot at rest whose target is told to be lost from ``begin`` to ``end`` [s], with its points elsewhere."""
+    """A robot at rest whose target is lost from ``begin`` to ``end`` [s], as is told, with points elsewhere."""
     detector, results = StandstillDetector(1, 1), []
     for k in range(int(seconds * 100)):
         time, stamp = k / 100, k * NANO // 100

@@ -92,7 +92,7 @@ def test_a_rail_and_an_arm_on_topics_and_at_rates_of_their_own(bench: Bench, rob
     for q in planned.configurations[:4]:
         found = shift.rest(q, 1.0)
         assert found.status == Measurement.ACCEPTED, found.reason
-        np.testing.assert_allclose(list(found.joint_positions), q, atol=1e-9)
+        np.testing.assert_allclose(list(found.configuration.positions), q, atol=1e-9)
     assert [w.left_out.total() for w in shift.node._intake.streams] == [0, 0, 0]
 
 
