@@ -12,7 +12,16 @@ from calib_planner.io.robots import URDF_SUFFIXES, Robot, config_folder, shipped
 
 if TYPE_CHECKING:
     from calib_planner.io.bag import read_bag
-    from calib_planner.io.cell import CELL_KEYS, EITHER, NAMED_MODELS, Cell, read_cell, write_cell
+    from calib_planner.io.cell import (
+        CELL_KEYS,
+        EITHER,
+        EVERYTHING_KNOWN,
+        NAMED_MODELS,
+        ROS_KEYS,
+        Cell,
+        read_cell,
+        write_cell,
+    )
     from calib_planner.io.conditions import planned_error_model, read_constraints, read_instrument, read_vertical
     from calib_planner.io.csv import format_table, measurements_text, write_configurations, write_measurements
     from calib_planner.io.data import (
@@ -93,12 +102,13 @@ if TYPE_CHECKING:
         write_calibrated_urdf,
     )
     from calib_planner.io.urdf_tree import UrdfChain
+    from calib_planner.io.xacro import read_urdf_text, split_arguments
 else:
     __getattr__, __dir__, __all__ = lazy_door(
         __name__,
         {
             "bag": "read_bag",
-            "cell": "CELL_KEYS EITHER NAMED_MODELS Cell read_cell write_cell",
+            "cell": "CELL_KEYS EITHER EVERYTHING_KNOWN NAMED_MODELS ROS_KEYS Cell read_cell write_cell",
             "conditions": "planned_error_model read_constraints read_instrument read_vertical",
             "csv": "format_table measurements_text write_configurations write_measurements",
             "data": "in_units is_bag read_configurations read_data read_joints read_plan_csv with_units",
@@ -120,6 +130,7 @@ else:
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_chain read_speed_limits require_urdf "
             "write_calibrated_urdf",
             "urdf_tree": "UrdfChain",
+            "xacro": "read_urdf_text split_arguments",
         },
         "Robot",
         "URDF_SUFFIXES",

@@ -13,7 +13,7 @@ option takes, and a length may carry its unit:
     units: mm,deg                 # of data files and of angles in arguments
 
 ``CELL_KEYS`` is the whole schema. ``Cell`` gives the pieces of problems; the command line takes the same values
-as options (``Cell.options``), and what is given there wins.
+as options (``Cell.options``), and what is given there wins. The keys of ``ROS_KEYS`` are for the nodes alone.
 """
 
 from __future__ import annotations
@@ -23,16 +23,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ACCURACIES, ErrorModel, Payload, gravity_of, typical
 from calib_planner.errors import InputError
 from calib_planner.io.conditions import read_constraints, read_instrument, read_vertical
 from calib_planner.io.error_model import read_error_model
 from calib_planner.io.robots import Robot, shipped_robots
+from calib_planner.io.sizes import angle_factors
 from calib_planner.io.text import user_path, write_text
 from calib_planner.io.yaml import Node, read_yaml, yaml_line
 from calib_planner.planning import Constraint
 from calib_planner.robot import parse_coupling
 from calib_planner.tracker import Isotropic, Noise
+from calib_planner.units import Units
 
 NAMED_MODELS = ("typical", "paper")
 MOUNTINGS = ("floor", "ceiling")
@@ -110,6 +115,38 @@ def _items(node: Node, counts: Sequence[int] = ()) -> list[Node]:
     if counts and len(items) not in counts:
         raise node.refused(f"{' or '.join(map(str, counts))} numbers")
     return items
+
+
+def _folder(node: Node) -> str:
+    """A folder that need not be there, its path from the folder of this file."""
+    return str(Path(node.path).parent / user_path(node.text()))
+
+
+def _count(low: int) -> Callable[[Node], int]:
+    def read(node: Node) -> int:
+        value = node.value
+        if type(value) is not int or value < low:
+            raise node.refused(f"a whole number, at least {low}")
+        return value
+
+    return read
+
+
+def _seconds(node: Node) -> float:
+    value = node.quantity("s")
+    if not 0 <= value <= 3600:
+        raise node.refused("0 to 3600 s")
+    return value
+
+
+def _above_zero(most: float, unit: str) -> Callable[[Node], float]:
+    def read(node: Node) -> float:
+        value = node.number()
+        if not 0 < value <= most:
+            raise node.refused(f"above 0, at most {most:g}{unit}")
+        return value
+
+    return read
 
 
 def _lengths(node: Node) -> tuple[float, ...]:
@@ -195,10 +232,35 @@ CELL_KEYS: dict[str, Key] = {
     "test-pose": Key(_rows(_numbers), "[q1, …, qn], or a list of these [rad | m]", "where accuracy matters"),
     "test-path": Key(_file, "path", "CSV of further test poses"),
     "units": Key(_some_of(UNITS), "mm, deg or mm,deg", "of data files and of angles in arguments (m and rad)"),
+    "speed": Key(_above_zero(100, " rad/s or m/s"), "number [rad/s | m/s]", "largest speed of every joint"),
+    "speed-share": Key(
+        _above_zero(1, ""), "share", "of the speed limits in the URDF, instead of speed"
+    ),
+    "settle": Key(_seconds, "time [s]", "at rest before each measurement, until the arm is still (2)"),
+    "dwell": Key(_seconds, "time [s]", "of each measurement, at rest (3)"),
+    "budget": Key(_count(2), "number", "measurements allowed in all in a campaign, with validation (60)"),
+    "validation": Key(_count(0), "number", "measurements of a campaign that take no part in the fit (6)"),
+    "store-folder": Key(
+        _folder, "path", "what was measured and what came of it; a restart goes on with it"
+    ),
+    "joint-topics": Key(
+        _words, "names", "topics of joint states, each with some of the joints (joint_states)"
+    ),
+    "tracker-topics": Key(_words, "names", "topics of the points, one per target (tracker/point)"),
+    "tracker-frames": Key(_words, "names", "child frame of each target, where the tracker sends transforms"),
+    "tracker-locked": Key(_words, "names", "topics on which the tracker says whether it holds each target"),
+    "controller": Key(Node.text, "name", "action FollowJointTrajectory of the robot's controller"),
+    "moveit-group": Key(
+        Node.text, "name", "MoveIt plans every move of this group (straight lines of joints)"
+    ),
+    "base-frame": Key(Node.text, "name", "frame of the robot's base (base_link)"),
 }
 """Key → how it is read and what it means; the names are those of the options."""
-EITHER = (("instrument", "sigma"), ("mounting", "vertical"))
+EITHER = (("instrument", "sigma"), ("mounting", "vertical"), ("speed", "speed-share"))
 """Keys of which one says what the other would."""
+ROS_KEYS = ("store-folder", "joint-topics", "tracker-topics", "tracker-frames", "tracker-locked", "controller",
+            "moveit-group", "base-frame")  # fmt: skip
+"""Keys that no command has as an option."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +285,15 @@ class Cell:
         required_accuracy: Largest acceptable error [m].
         test_pose: Rows of joint values, in the unit that ``units`` says.
         units: Of data files and of angles: ``mm``, ``deg`` or both; metres and radians otherwise.
+        speed: Largest speed of every joint [rad/s | m/s].
+        speed_share: Share of the joints' speed limits.
+        settle, dwell: Times at rest, before and for a measurement [s].
+        budget, validation: Measurements of a campaign.
+        store_folder: Path of a folder.
+        joint_topics, tracker_topics, tracker_frames, tracker_locked: Names of topics and frames.
+        controller: Name of an action.
+        moveit_group: Name of a planning group.
+        base_frame: Name of a frame.
     """
 
     path: str
@@ -245,11 +316,25 @@ class Cell:
     test_pose: tuple[tuple[float, ...], ...] | None = None
     test_path: str | None = None
     units: tuple[str, ...] | None = None
+    speed: float | None = None
+    speed_share: float | None = None
+    settle: float | None = None
+    dwell: float | None = None
+    budget: int | None = None
+    validation: int | None = None
+    store_folder: str | None = None
+    joint_topics: tuple[str, ...] | None = None
+    tracker_topics: tuple[str, ...] | None = None
+    tracker_frames: tuple[str, ...] | None = None
+    tracker_locked: tuple[str, ...] | None = None
+    controller: str | None = None
+    moveit_group: str | None = None
+    base_frame: str | None = None
 
     def options(self) -> dict[str, tuple[str, ...]]:
         """Option → the values that it would be given; without a value for one that is switched on."""
         given: dict[str, tuple[str, ...]] = {}
-        for key in CELL_KEYS:
+        for key in (key for key in CELL_KEYS if key not in ROS_KEYS):
             value = getattr(self, field_of(key))
             if key == "units":
                 given |= {"--degrees": ()} if "deg" in (value or ()) else {}
@@ -287,6 +372,27 @@ class Cell:
         if self.instrument is not None:
             return read_instrument(self.instrument)
         return None if self.sigma is None else Isotropic(self.sigma)
+
+    def load_test_poses(self, robot: Robot) -> FloatArray | None:
+        """(K, joints) where accuracy matters [rad | m]; ``None`` where the cell does not say.
+
+        Raises:
+            FileFormatError: A row does not fit ``robot``, or the file of further ones cannot be used.
+        """
+        # What reads tables, 0.05 s, is imported for test poses only.
+        from calib_planner.io.data import read_configurations
+        from calib_planner.io.understanding import Reading
+
+        units, names, poses = self.units or (), robot.joint_names, []
+        for row in self.test_pose or ():
+            if len(row) != len(names):
+                node = Node(self.path, "test-pose", row)
+                raise node.error(f"{len(row)} numbers", f"{len(names)} numbers a pose: {', '.join(names)}")
+            poses.append(np.array([row]) * angle_factors(robot, degrees="deg" in units))
+        if self.test_path is not None:
+            otherwise = Units("mm" if "mm" in units else "", "deg" if "deg" in units else "")
+            poses.append(read_configurations(self.test_path, robot, Reading(otherwise=otherwise)))
+        return np.vstack(poses) if poses else None
 
     def load_constraints(self, robot: Robot) -> tuple[Constraint, ...]:
         """What may be measured."""

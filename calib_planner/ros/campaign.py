@@ -31,9 +31,10 @@ from calib_planner.campaign import (
     Paused,
 )
 from calib_planner.errors import InputError
-from calib_planner.io import read_error_model, write_estimate, write_measurements
+from calib_planner.io import write_estimate, write_measurements
 from calib_planner.measurements import configuration_labels
 from calib_planner.planning import Plan, PlanQuality
+from calib_planner.ros.cell import error_model_of, instrument_of
 from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import (
@@ -78,7 +79,8 @@ def problem_of(settings: CampaignParameters, model: Model | NotReady) -> Campaig
         np.array(settings.test_pose_rows),
         settings.required_accuracy,
         constraints=constraints_of(settings, robot),
-        identification={"error_model": read_error_model(settings.error_model)},
+        noise=instrument_of(settings),
+        identification={"error_model": error_model_of(settings, robot)},
         **{name: getattr(settings, name) for name in SAME},
     )
 

@@ -21,9 +21,22 @@ from std_msgs.msg import String
 
 from calib_planner.arrays import FloatArray, frozen
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, UnknownNameError
-from calib_planner.io import StoredModel, parse_speed_limits, parse_urdf, read_text, shipped_robots, stored_model
+from calib_planner.io import (
+    URDF_SUFFIXES,
+    Cell,
+    StoredModel,
+    parse_speed_limits,
+    parse_urdf,
+    read_speed_limits,
+    read_text,
+    read_urdf_text,
+    shipped_robots,
+    split_arguments,
+    stored_model,
+)
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot
+from calib_planner.ros.cell import cell_of
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import in_ros
 from calib_planner.ros.parameters import LATCHED
@@ -63,6 +76,22 @@ def shipped_model(name: str, parameters: str | Sequence[str], unknown: str) -> M
     """A shipped robot without speed limits; errors as ``load_shipped``."""
     robot = load_shipped(name, parameters, unknown)
     return Model(robot, _no_limits(robot))
+
+
+def cell_model(cell: Cell, parameters: str | Sequence[str], unknown: str) -> Model:
+    """The robot of a cell and the speed limits of its URDF.
+
+    Raises:
+        CalibPlannerError: The cell, or the file of its robot, cannot be used.
+    """
+    robot = cell.load_robot().with_parameters(parameters, unknown_words(unknown))
+    speeds = read_speed_limits(robot.source, robot.joint_names) if is_urdf(robot) else None
+    return Model(robot, _no_limits(robot) if speeds is None else speeds)
+
+
+def is_urdf(robot: Robot) -> bool:
+    """Whether a robot was read from a URDF."""
+    return split_arguments(robot.source)[0].suffix in URDF_SUFFIXES
 
 
 def load_shipped(
@@ -144,10 +173,13 @@ class ModelSource:
             f"no robot yet: publish a URDF on {TOPIC} (latched), or set the parameter robot; "
             "a request may also name a shipped robot"
         )
-        if settings.robot:
-            wanted = (DEFAULT_LEVEL, "")
-            if isinstance(settings, PlanParameters):
-                wanted = (settings.parameters, settings.unknown)
+        wanted = (DEFAULT_LEVEL, "")
+        if isinstance(settings, PlanParameters):
+            wanted = (settings.parameters, settings.unknown)
+        cell = cell_of(settings)
+        if cell is not None:
+            self.model = cell_model(cell, *wanted)
+        elif settings.robot:
             self.model = shipped_model(settings.robot, *wanted)
 
     def follow(self, node: ManagedNode[Any], taken: Callable[[Model], None], **options: Any) -> None:
@@ -162,7 +194,7 @@ class ModelSource:
             if model is not None:
                 taken(model)
 
-        if self._settings.use_robot_description:
+        if self._settings.use_robot_description and not self._settings.cell:
             node.create_subscription(String, TOPIC, on_description, LATCHED, **options)
 
     def take(self, text: str) -> Model | None:
@@ -204,7 +236,8 @@ class IdentifiedModel:
     @property
     def urdf(self) -> str:
         """The URDF that it was read from; empty if it was not read from one."""
-        return self.stored.source if self.stored.origin == TOPIC else ""
+        text = self.stored.source
+        return text if text.lstrip().startswith("<") else ""
 
     def follow(self, plan: Plan) -> Robot:
         """The robot with the free parameters of a plan, unless the node's own say otherwise.
@@ -222,13 +255,19 @@ def first_model(settings: IdentifierParameters) -> IdentifiedModel | None:
     Raises:
         CalibPlannerError: There is no such robot, it has no such parameters, or the store cannot be used.
     """
+    cell, level = cell_of(settings), settings.parameters or DEFAULT_LEVEL
+    targets = len(settings.tracker_topics)
+    if cell is not None:
+        robot = with_targets(cell.load_robot(), targets, settings.unknown)
+        robot = robot.with_parameters(level, unknown_words(settings.unknown))
+        text = read_urdf_text(robot.source) if is_urdf(robot) else read_text(robot.source, "a robot YAML")
+        return _identified(robot, text, cell.path, settings)
     if settings.use_robot_description:
         stored = stored_model(settings.store_folder)
         if stored is not None and stored.origin == TOPIC:
             return heard_model(stored.source, settings)
     if not settings.robot:
         return None
-    level, targets = settings.parameters or DEFAULT_LEVEL, len(settings.tracker_topics)
     robot = load_shipped(settings.robot, level, settings.unknown, targets)
     return _identified(robot, read_text(robot.source, "a robot YAML"), settings.robot, settings)
 

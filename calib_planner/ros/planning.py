@@ -18,7 +18,7 @@ from calib_planner_msgs.msg import PlanRequest
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ACCURACIES
 from calib_planner.errors import InfeasibleError, InputError
-from calib_planner.io import NAMED_MODELS, config_folder, planned_error_model, read_constraints
+from calib_planner.io import NAMED_MODELS, config_folder, read_constraints
 from calib_planner.planning import (
     Callback,
     Candidates,
@@ -31,6 +31,7 @@ from calib_planner.planning import (
     plan_for_time,
 )
 from calib_planner.robot import Robot
+from calib_planner.ros.cell import cell_of, instrument_of, planned_model_of
 from calib_planner.ros.messages import check_rows, pace_of, seconds_of
 from calib_planner.ros.model import Model, NotReady, shipped_model
 from calib_planner.ros.settings import PaceParameters, PlannerParameters, PlanParameters, unknown_words
@@ -127,7 +128,8 @@ def problem_of(request: PlanRequest, settings: PlannerParameters, model: Model) 
         raise InputError("configurations", size, most)
     criterion = request.criterion or settings.criterion
     candidates = _candidates(request, settings, robot)
-    noise = _number(request, settings, "sigma")
+    noise = (None if request.sigma else instrument_of(settings)) or _number(request, settings, "sigma")
+    _word(request, settings, "error_model", NAMED_MODELS)
     return PlanProblem(
         robot,
         poses,
@@ -137,7 +139,7 @@ def problem_of(request: PlanRequest, settings: PlannerParameters, model: Model) 
         noise=noise,
         criterion=criterion,
         constraints=constraints_of(settings, robot),
-        error_model=planned_error_model(_word(request, settings, "error_model", NAMED_MODELS), robot, noise),
+        error_model=planned_model_of(settings, request.error_model, robot, noise),
         accuracy_frame=_word(request, settings, "accuracy_frame", ACCURACIES),
         search=Search(
             starts=settings.starts or None,
@@ -169,11 +171,14 @@ def _word(request: PlanRequest, settings: PlannerParameters, name: str, valid: S
 
 
 def constraints_of(settings: PlanParameters, robot: Robot) -> tuple[Constraint, ...]:
-    """The constraints of the file that the node's parameters name.
+    """The constraints of the cell, or of the file that the node's parameters name.
 
     Raises:
         InputError: The name leaves the folder, or the file does not fit the robot.
     """
+    cell = cell_of(settings)
+    if cell is not None:
+        return cell.load_constraints(robot)
     if not settings.constraints:
         return ()
     folder = settings.constraints_folder

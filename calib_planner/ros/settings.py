@@ -34,6 +34,10 @@ FRAME = "accuracy at the test poses: in the frame of the points (world), or up t
 BASE_FRAME = "name of the robot's base frame"
 TOPICS = "topics of the tracker's points, one per target"
 PLAN_TOPIC = "topic of the plan that ~/execute executes"
+CELL = (
+    "path of a cell.yaml, whose robot, instrument, constraints and error model take the place of the parameters "
+    "for them; empty = none"
+)
 LARGEST_SEED = 2**31 - 1
 
 
@@ -51,6 +55,7 @@ def unknown_words(text: str) -> list[str]:
 class RobotParameters(LifecycleParameters):
     """Which robot a node works for."""
 
+    cell: str = parameter("", CELL, read_only=True)
     robot: str = at_configure("kuka_kr270", "name of a shipped robot; empty = wait for robot_description")
     use_robot_description: bool = at_configure(
         True, "a URDF on robot_description replaces robot (in the identifier until a measurement is accepted)"
@@ -210,6 +215,7 @@ class ExecutorParameters(Watch, PaceParameters, RobotParameters):
 class SimulatorParameters(LifecycleParameters, Faults):
     """Parameters of ``tracker_simulator``."""
 
+    cell: str = parameter("", CELL, read_only=True)
     robot: str = at_configure("kuka_kr270", "name of a shipped robot")
     parameters: str = at_configure("lengths+offsets", "which parameters have true errors: a level or names")
     seed: int = at_configure(0, "seed of everything that is drawn", "", 0, LARGEST_SEED)

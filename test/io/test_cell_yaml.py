@@ -10,7 +10,7 @@ import pytest
 from calib_planner import Robot
 from calib_planner.cli import parser
 from calib_planner.errors import FileFormatError
-from calib_planner.io import CELL_KEYS, Cell, read_cell, write_cell
+from calib_planner.io import CELL_KEYS, ROS_KEYS, Cell, read_cell, write_cell
 from calib_planner.planning import MinimumHeight
 from calib_planner.tracker import Isotropic, LaserTracker
 
@@ -38,7 +38,11 @@ def test_every_key_is_read_and_paths_are_from_the_file(folder: Path) -> None:
         "robot: ../arm.yaml\nbase-link: base\ntip-link: tool0\ntargets: [[60mm, 0, -0.09], [0, 1cm, 0]]\n"
         "parameters: full\nunknown: base,tool\npayload: [3kg, 0, 0, 50mm]\nmounting: [1, 0, 0]\n"
         "instrument: ../tracker.yaml\nconstraints: ../low.yaml\nerror-model: paper\naccuracy-frame: robot\n"
-        "required-accuracy: 0.1mm\ntest-pose: [[0, 90], [10, 20]]\nunits: mm,deg\n",
+        "required-accuracy: 0.1mm\ntest-pose: [[0, 90], [10, 20]]\nunits: mm,deg\n"
+        "speed-share: 0.3\nsettle: 500ms\ndwell: 2\nbudget: 40\nvalidation: 5\nstore-folder: ../store\n"
+        "joint-topics: rail/joint_states, arm/joint_states\ntracker-topics: [tracker/one]\n"
+        "tracker-frames: ball\ntracker-locked: tracker/locked\ncontroller: arm/follow_joint_trajectory\n"
+        "moveit-group: arm\nbase-frame: base\n",
     )
     at = str(folder / "cells" / "..")
     assert cell == Cell(
@@ -58,7 +62,21 @@ def test_every_key_is_read_and_paths_are_from_the_file(folder: Path) -> None:
         required_accuracy=1e-4,
         test_pose=((0.0, 90.0), (10.0, 20.0)),
         units=("mm", "deg"),
+        speed_share=0.3,
+        settle=0.5,
+        dwell=2.0,
+        budget=40,
+        validation=5,
+        store_folder=f"{at}/store",
+        joint_topics=("rail/joint_states", "arm/joint_states"),
+        tracker_topics=("tracker/one",),
+        tracker_frames=("ball",),
+        tracker_locked=("tracker/locked",),
+        controller="arm/follow_joint_trajectory",
+        moveit_group="arm",
+        base_frame="base",
     )
+    assert np.allclose(cell.load_test_poses(Robot.load("planar_2r")), np.radians([[0, 90], [10, 20]]))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -105,6 +123,12 @@ def test_forms_of_values(folder: Path, text: str, field: str, value: object) -> 
         ("units: inch", ["units", "mm, deg"]),
         ("accuracy-frame: tool", ["accuracy-frame", "world, robot"]),
         ("mounting: floor\nvertical: [0, 0, 1]", ["vertical", "one of the two"]),
+        ("speed: 1\nspeed-share: 0.5", ["speed-share", "one of the two"]),
+        ("speed-share: 2", ["speed-share", "at most 1"]),
+        ("speed: 0", ["speed", "above 0", "rad/s or m/s"]),
+        ("settle: 2h", ["settle", "0 to 3600 s"]),
+        ("budget: 1", ["budget", "at least 2"]),
+        ("budget: 2.5", ["budget", "a whole number"]),
         ("sigma: 1mm\ninstrument: ../tracker.yaml", ["sigma", "one of the two"]),
         ("- robot", ["document", "a YAML file of a cell"]),
     ],
@@ -155,8 +179,8 @@ def test_what_is_written_is_read(folder: Path) -> None:
 
 
 def test_every_key_is_an_option_of_a_command() -> None:
-    """A key that no command takes would be read and forgotten."""
+    """A key that neither a command nor a node takes would be read and forgotten."""
     top = parser()
     commands = next(a.choices for a in top._actions if a.dest == "command")
     flags = {flag for command in commands.values() for flag in command._option_string_actions}
-    assert not {f"--{key}" for key in CELL_KEYS} - flags
+    assert {f"--{key}" for key in CELL_KEYS} - flags == {f"--{key}" for key in ROS_KEYS}

@@ -34,9 +34,9 @@ from calib_planner.io import (
     UnavailableStore,
     calibrated_urdf,
     open_store,
-    read_error_model,
 )
 from calib_planner.ros import session as saving
+from calib_planner.ros.cell import error_model_of
 from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import (
@@ -138,13 +138,13 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         if not chosen.store_folder:
             text = "the session is in memory only and lost with the node: set store_folder to keep it"
             self.get_logger().warning(text)
-        self._error_model = read_error_model(chosen.error_model)
+        self._error_model = error_model_of(chosen)
         self._output = IdentifierOutput(self)
         self._locked: dict[int, bool] = {}  # target → whether the tracker sees it, as far as it said
         self.undo_with(self._leave_session)
         self._begin_with_stored()
         self.create_subscription(PlanMessage, chosen.plan_topic, self._on_plan, LATCHED)
-        if chosen.use_robot_description:
+        if chosen.use_robot_description and not chosen.cell:
             self.create_subscription(String, TOPIC, self._on_description, LATCHED)
         hears = Listener(self._on_joints, self._on_point, self._on_state, self._on_lost)
         self._streams = DriverStreams(self, chosen.topics, chosen.tracker_type, hears)

@@ -26,8 +26,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
 from calib_planner.errors import CalibPlannerError, InputError
-from calib_planner.io import config_folder, read_error_model, read_instrument
+from calib_planner.io import config_folder, read_instrument
 from calib_planner.planning import Trajectory
+from calib_planner.ros.cell import cell_of, error_model_of, instrument_of
 from calib_planner.ros.executor import ACTION, NewestPlan, check_executable, dwell_of, feedback_message
 from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.messages import (
@@ -352,13 +353,15 @@ def make_world(chosen: SimulatorParameters) -> World:
         InputError: A robot, parameter or true deviation that does not exist.
         FileFormatError: The file of the error model is not readable.
     """
-    robot = load_shipped(chosen.robot, chosen.parameters)
+    own = cell_of(chosen)
+    robot = load_shipped(chosen.robot, chosen.parameters) if own is None else own.load_robot()
+    robot = robot.with_parameters(chosen.parameters)
     given = chosen.deviations(robot.available_parameters)
     errors = given or random_deviations(robot, chosen.seed, chosen.length_error, chosen.angle_error)
-    instrument = None
+    instrument = instrument_of(chosen)
     if chosen.instrument != "sigma":
         instrument = read_instrument(config_folder() / "instruments" / f"{chosen.instrument}.yaml")
-    model = read_error_model(chosen.error_model)
+    model = error_model_of(chosen, robot)
     cell = SimulatedCell(robot, errors, chosen.sigma, instrument, model, chosen.seed)
     return World(cell, chosen, chosen.seed)
 
