@@ -29,9 +29,8 @@ lint: setup ## ruff and mypy
 wheel: ## build the wheel; install and use it without ROS in every Python 3.10 … 3.13 that is there
 	@tools/wheel.sh
 
-bench: setup ## ratios against Pinocchio and FIGAROH, efficiencies, real data (minutes; JSON to results/)
-	@mkdir -p results; . ./env.sh && for name in kinematics planning pools real_robot half_and_double minutes identification coverage streaming; do \
-	  echo "== $$name"; python bench/$$name.py > results/$$name.json || exit 1; done
+bench: setup ## peers, bounds, measured robots: docs/benchmarks.md with its pictures (half an hour; JSON to results/)
+	@. ./env.sh && OMP_NUM_THREADS=1 python bench/page.py --run
 
 soak: setup ## the identifier at 1 kHz for 10 minutes: none lost, memory flat (SOAK='--minutes 2'; JSON to results/)
 	@mkdir -p results; . ./env.sh && python bench/soak.py $(SOAK) > results/soak.json
