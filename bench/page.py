@@ -396,7 +396,7 @@ def page(results: Path) -> str:
         "",
         "This page is written by `make bench`, which runs the files in `bench/` and draws what they measured.",
         "Two sides of a comparison took turns in one run, so that what else the machine did fell on both; read",
-        "ratios rather than times. Seeds and splits are in the files, and the same run gives the same rows again.",
+        "ratios rather than times. Seeds and splits are in the files: the same run has the same rows.",
         "",
         f"Measured on {datetime.date.today().isoformat()} with {machine()}.",
         "",
