@@ -3,7 +3,7 @@
 from calib_planner import __version__
 
 project = "calib_planner"
-author = "The calib_planner authors"
+author = "calib_planner contributors"
 project_copyright = author
 version = release = __version__
 language = "en"

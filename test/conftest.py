@@ -1,4 +1,4 @@
-"""Makes ``import robots`` work from every test folder; the nodes' tests, which mostly wait, come first."""
+"""Makes ``robots`` and the tools importable from every test folder; the nodes' tests, which wait, come first."""
 
 import signal
 import sys
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 pytest_plugins = ["processor_time"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():

@@ -103,6 +103,18 @@ def test_setup_py_and_package_xml_agree() -> None:
     assert "pytest" in call["extras_require"]["test"], "by this colcon test runs pytest"
 
 
+def test_authors_and_addresses_agree() -> None:
+    call, stated = setup_call(), []
+    for name in ("package.xml", "msg_defs/package.xml"):
+        root = ET.parse(ROOT / name).getroot()
+        stated += [(e.text, e.get("email")) for kind in ("author", "maintainer") for e in root.iter(kind)]
+        assert {e.get("type"): e.text for e in root.iter("url")}["website"] == call["url"]
+    assert stated == [(call["author"], call["author_email"])] * 4
+    assert (call["maintainer"], call["maintainer_email"]) == (call["author"], call["author_email"])
+    for name in ("CITATION.cff", "LICENSE", "docs/conf.py", "tools/headers.py"):
+        assert call["author"] in (ROOT / name).read_text(encoding="utf-8"), name
+
+
 def test_every_node_is_an_executable() -> None:
     scripts = dict(text.split(" = ") for text in setup_call()["entry_points"]["console_scripts"])
     parts = {p.stem for p in (PACKAGE / "ros" / "nodes").glob("*.py")} - {"__init__"}
