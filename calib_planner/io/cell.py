@@ -233,26 +233,18 @@ CELL_KEYS: dict[str, Key] = {
     "test-path": Key(_file, "path", "CSV of further test poses"),
     "units": Key(_some_of(UNITS), "mm, deg or mm,deg", "of data files and of angles in arguments (m and rad)"),
     "speed": Key(_above_zero(100, " rad/s or m/s"), "number [rad/s | m/s]", "largest speed of every joint"),
-    "speed-share": Key(
-        _above_zero(1, ""), "share", "of the speed limits in the URDF, instead of speed"
-    ),
+    "speed-share": Key(_above_zero(1, ""), "share", "of the speed limits in the URDF, instead of speed"),
     "settle": Key(_seconds, "time [s]", "at rest before each measurement, until the arm is still (2)"),
     "dwell": Key(_seconds, "time [s]", "of each measurement, at rest (3)"),
     "budget": Key(_count(2), "number", "measurements allowed in all in a campaign, with validation (60)"),
     "validation": Key(_count(0), "number", "measurements of a campaign that take no part in the fit (6)"),
-    "store-folder": Key(
-        _folder, "path", "what was measured and what came of it; a restart goes on with it"
-    ),
-    "joint-topics": Key(
-        _words, "names", "topics of joint states, each with some of the joints (joint_states)"
-    ),
+    "store-folder": Key(_folder, "path", "what was measured and what came of it; a restart goes on with it"),
+    "joint-topics": Key(_words, "names", "topics of joint states, each with some of the joints (joint_states)"),
     "tracker-topics": Key(_words, "names", "topics of the points, one per target (tracker/point)"),
     "tracker-frames": Key(_words, "names", "child frame of each target, where the tracker sends transforms"),
     "tracker-locked": Key(_words, "names", "topics on which the tracker says whether it holds each target"),
     "controller": Key(Node.text, "name", "action FollowJointTrajectory of the robot's controller"),
-    "moveit-group": Key(
-        Node.text, "name", "MoveIt plans every move of this group (straight lines of joints)"
-    ),
+    "moveit-group": Key(Node.text, "name", "MoveIt plans every move of this group (straight lines of joints)"),
     "base-frame": Key(Node.text, "name", "frame of the robot's base (base_link)"),
 }
 """Key → how it is read and what it means; the names are those of the options."""

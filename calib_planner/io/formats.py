@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 from calib_planner.errors import FileFormatError
@@ -44,6 +45,16 @@ REFUSED: tuple[tuple[bytes, str, str], ...] = (
 """First bytes → what the file is, and the one thing to do."""
 
 
+READERS: tuple[tuple[Callable[[bytes], bool], Callable[[str | Path, bytes, str], RawLines]], ...] = (
+    (lambda data: _archive_with(data, b"[Content_Types].xml") or _is_archive(data) and b"xl/" in data, read_xlsx),
+    (lambda data: _archive_with(data, b".npy"), lambda path, data, what: read_npz(path, data)),
+    (lambda data: data.startswith(b"\x93NUMPY"), lambda path, data, what: read_npy(path, data)),
+    (lambda data: data.startswith(b"MATLAB 5.0"), lambda path, data, what: read_mat(path, data)),
+)
+"""Kinds of binary files: whether a file is one, and what makes raw lines of its path, its bytes and the word for
+what it should hold. The first that says yes reads the file."""
+
+
 def raw_lines(path: str | Path, what: str) -> RawLines:
     """Read a file of any kind that holds a table.
 
@@ -59,12 +70,15 @@ def raw_lines(path: str | Path, what: str) -> RawLines:
         marked = magic[:1] in b"<{"  # text, in which blanks and capitals do not count
         if start.lower().startswith(magic.lower()) if marked else data.startswith(magic):
             raise FileFormatError(path, "file", kind, f"{what}: {TABLE}", advice)
-    if data.startswith(b"PK\x03\x04"):
-        return _archive(path, data, what)
-    if data.startswith(b"\x93NUMPY"):
-        return read_npy(path, data)
-    if data.startswith(b"MATLAB 5.0"):
-        return read_mat(path, data)
+    for recognises, read in READERS:
+        if recognises(data):
+            return read(path, data, what)
+    if _archive_with(data, b"opendocument"):
+        raise FileFormatError(
+            path, "file", "an OpenDocument file (.ods)", f"{what}: {TABLE}", "save it as .xlsx or CSV"
+        )
+    if _is_archive(data):
+        raise FileFormatError(path, "file", "a ZIP archive", f"{what}: {TABLE}", "unpack it")
     text, encoding = decode_any(path, what, data)
     suffix = user_path(path).suffix.lower()
     if suffix in (".yaml", ".yml"):
@@ -85,15 +99,11 @@ def _is_json(text: str) -> bool:
     return True
 
 
-def _archive(path: str | Path, data: bytes, what: str) -> RawLines:
-    """A file that is a ZIP archive inside: XLSX, NPZ or neither."""
-    names = data[: 1 << 16]
-    if b"[Content_Types].xml" in names or b"xl/" in data:
-        return read_xlsx(path, data, what)
-    if b".npy" in names:
-        return read_npz(path, data)
-    advice = "unpack it"
-    kind = "a ZIP archive"
-    if b"opendocument" in names:
-        kind, advice = "an OpenDocument file (.ods)", "save it as .xlsx or CSV"
-    raise FileFormatError(path, "file", kind, f"{what}: {TABLE}", advice)
+def _is_archive(data: bytes) -> bool:
+    """Whether a file is a ZIP archive inside."""
+    return data.startswith(b"PK\x03\x04")
+
+
+def _archive_with(data: bytes, name: bytes) -> bool:
+    """Whether it is one that names such a file, or part of a name, near its start."""
+    return _is_archive(data) and name in data[: 1 << 16]

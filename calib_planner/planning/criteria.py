@@ -27,7 +27,7 @@ Pathre 1990; O3, O4: Nahvi et al. 1994, 1996; O5: Sun and Hollerbach 2008.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -35,10 +35,6 @@ import numpy as np
 
 from calib_planner.arrays import FloatArray
 
-CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
-"""Names that a problem may use."""
-POSE_CRITERIA = ("test_pose", "worst_pose")
-"""Those that need test poses; their values are accuracies [m]."""
 RIDGE = 1e-12
 """Added to the information of a plan while searching, relative to its mean diagonal, so that singular plans stay
 finite."""
@@ -342,6 +338,52 @@ def accuracy_weights(jacobians: FloatArray) -> FloatArray:
     return np.einsum("kia,kib->kab", jacobians, jacobians) / (jacobians.shape[1] / 3)
 
 
+@dataclass(frozen=True)
+class Row:
+    """A criterion that a problem may ask for by its name.
+
+    Attributes:
+        make: Makes Ψ of p, the number of parameters of interest, and A (p, p), the weighted mean of the matrices
+            A_k of ``accuracy_weights``, and these (K, p, p); without test poses there are none.
+        reported: Ψ, p and the number of measurements → the value reported, last column of the table at the top.
+        poses: Whether it needs test poses; its values are accuracies [m].
+        minimised: Whether a smaller reported value is the better one.
+    """
+
+    make: Callable[[int, FloatArray, FloatArray], Criterion]
+    reported: Callable[[float, int, int], float] = lambda psi, size, measurements: psi
+    poses: bool = False
+    minimised: bool = False
+
+
+def _root(psi: float, size: int, measurements: int) -> float:
+    return float(np.sqrt(psi))
+
+
+def _accuracy(psi: float, size: int, measurements: int) -> float:
+    return float(psi**-0.5)
+
+
+TABLE = {
+    "test_pose": Row(lambda p, mean, each: Accuracy(mean), _accuracy, poses=True, minimised=True),
+    "worst_pose": Row(lambda p, mean, each: WorstAccuracy(each), _accuracy, poses=True, minimised=True),
+    "d": Row(lambda p, mean, each: Determinant()),
+    "d_star": Row(lambda p, mean, each: DiagonalDeterminant()),
+    "a": Row(lambda p, mean, each: Accuracy(np.eye(p) / p), lambda psi, size, m: size / psi, minimised=True),
+    "e": Row(lambda p, mean, each: PowerMean(8.0, smallest=True)),
+    "o1": Row(lambda p, mean, each: Determinant(), lambda psi, size, m: float(np.sqrt(psi / m))),
+    "o2": Row(lambda p, mean, each: EigenvalueRatio(1.0), _root),
+    "o3": Row(lambda p, mean, each: PowerMean(8.0, smallest=True), _root),
+    "o4": Row(lambda p, mean, each: EigenvalueRatio(2.0), _root),
+    "o5": Row(lambda p, mean, each: PowerMean(0.5), lambda psi, size, m: float(np.sqrt(psi)) / size),
+}
+"""Name → criterion. Options, parameters, messages and tests read it."""
+CRITERIA = tuple(TABLE)
+"""Names that a problem may use."""
+POSE_CRITERIA = tuple(name for name, row in TABLE.items() if row.poses)
+"""Those that need test poses; their values are accuracies [m]."""
+
+
 def make_criterion(
     name: str, size: int, test_weights: FloatArray, shares: Sequence[float] | FloatArray
 ) -> Criterion:
@@ -350,25 +392,13 @@ def make_criterion(
     Args:
         name: One of ``CRITERIA``.
         size: p, number of parameters of interest.
-        test_weights: (K, p, p) from ``accuracy_weights``.
+        test_weights: (K, p, p) from ``accuracy_weights``; only criteria with test poses look at them.
         shares: (K,) weights of the test poses.
     """
+    row = TABLE[name]
     share = np.asarray(shares, float) / np.sum(shares)
-    if name == "worst_pose":
-        return WorstAccuracy(test_weights)
-    if name in ("d", "o1"):
-        return Determinant()
-    if name == "d_star":
-        return DiagonalDeterminant()
-    if name == "a":
-        return Accuracy(np.eye(size) / size)
-    if name in ("e", "o3"):
-        return PowerMean(8.0, smallest=True)
-    if name == "o5":
-        return PowerMean(0.5)
-    if name in ("o2", "o4"):
-        return EigenvalueRatio(1.0 if name == "o2" else 2.0)
-    return Accuracy(np.einsum("k,kab->ab", share, test_weights))
+    mean = np.einsum("k,kab->ab", share, test_weights) if row.poses else test_weights
+    return row.make(size, mean, test_weights)
 
 
 def ridged(matrices: FloatArray) -> FloatArray:
@@ -384,22 +414,9 @@ def log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
     return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)
 
 
-MINIMISED = (*POSE_CRITERIA, "a")
-"""Criteria whose reported value is the better the smaller it is."""
-
-
 def reported_value(name: str, psi: float, size: int, measurements: int) -> float:
     """The reported value (last column of the table at the top) for Ψ."""
+    row = TABLE[name]
     if psi <= 0:
-        return float("inf") if name in MINIMISED else 0.0
-    if name in POSE_CRITERIA:
-        return float(psi**-0.5)
-    if name == "a":
-        return size / psi
-    if name == "o1":
-        return float(np.sqrt(psi / measurements))
-    if name in ("o2", "o3", "o4"):
-        return float(np.sqrt(psi))
-    if name == "o5":
-        return float(np.sqrt(psi)) / size
-    return psi
+        return float("inf") if row.minimised else 0.0
+    return row.reported(psi, size, measurements)
