@@ -1,15 +1,14 @@
-// The 3-D view: what is drawn and from where it is seen; calibration_controls.js turns it.
+// The 3-D view of a scene (report/scene.py): what is drawn and from where it is seen; scene_controls.js turns it.
 // A camera orbits a fixed centre; everything is drawn far to near on a 2-D canvas, in perspective.
 // World: axes of the robot's base, z up [m]. Screen: pixels of the page. No library, no WebGL.
-const calibrationView = (function () {
+function sceneView(scene) {
   "use strict";
-  const data = JSON.parse(document.getElementById("report-data").textContent);
-  const scene = data.scene, count = scene.points.length;
+  const count = scene.points.length;
 
   const HOME = { yaw: -0.87, pitch: 0.38, zoom: 1 };
   const FACTORS = Array.from({ length: 16 }, (_, i) => [1, 2, 5][i % 3] * 10 ** Math.floor(i / 3));
   const SHADES = [[158, 188, 218], [140, 150, 198], [140, 107, 177], [136, 65, 157], [110, 1, 107]];
-  const INK = "#16202a", SOFT = "#5b6770", GROSS = "#d55e00", TEST = "#00805a", ARM = "#35516b";
+  const INK = "#16202a", SOFT = "#5b6770", GROSS = "#d55e00", TEST = "#00805a", ARM = "#35516b", AHEAD = "#0072b2";
   const REJECTED = 2, MOST_ARROWS = 400;
 
   // ── what does not change ──────────────────────────────────────────────────────────────────────────
@@ -27,7 +26,9 @@ const calibrationView = (function () {
     arrowed[when] = errors[when].map((e, i) => good[i] && e >= least);
   }
   const robotOf = new Map(scene.robot_rows.map((row, i) => [row, i]));
-  const solid = [[[0, 0, 0]], scene.robots.flat(), scene.test_robots.flat(), scene.points.filter((_, i) => good[i])].flat();
+  const ahead = scene.robot_rows.flatMap((row, i) => (scene.ahead && scene.ahead.includes(row) ? [i] : []));
+  const targetOf = (i) => scene.robots[i][scene.robots[i].length - 1];
+  const solid = [[[0, 0, 0]], scene.now || [], scene.robots.flat(), scene.test_robots.flat(), scene.points.filter((_, i) => good[i])].flat();
   const bounds = boundsOf(solid);
   const step = [0.1, 0.2, 0.5, 1, 2, 5, 10].find((s) => bounds.radius / s < 5) || 20;
 
@@ -109,7 +110,13 @@ const calibrationView = (function () {
       items.push({ depth: at.depth - 1e-6, paint: () => arrow(pen, from, to, colour, long < state.factor) });
     });
     scene.test_robots.forEach((body) => body_items(items, pen, see, body, TEST, 2, true));
-    if (scene.robots.length) body_items(items, pen, see, scene.robots[state.robot], ARM, 0.035 * bounds.radius, false);
+    for (const i of ahead) {
+      const at = see(targetOf(i));
+      items.push({ depth: at.depth, paint: () => disc(pen, at, i === state.robot ? 7 : 4.5, "#fff", AHEAD) });
+    }
+    const thick = 0.035 * bounds.radius, chosen = scene.robots[state.robot];
+    if (scene.now && chosen) body_items(items, pen, see, chosen, AHEAD, 2.5, true);
+    if (scene.now || chosen) body_items(items, pen, see, scene.now || chosen, ARM, thick, false);
     if (scene.tracker) items.push(station(pen, see(scene.tracker), width, height), beam(pen, see));
     items.sort((a, b) => b.depth - a.depth);
     for (const item of items) item.paint();
@@ -191,7 +198,7 @@ const calibrationView = (function () {
       const [a, b] = [see(tip), see(target)];
       items.push({ depth: b.depth, paint: () => {
         line(pen, a, b, colour, 1.6);
-        disc(pen, b, ghost ? 5 : 3, ghost ? TEST : "#fff", ghost ? "#fff" : INK);
+        disc(pen, b, ghost ? 5 : 3, ghost ? colour : "#fff", ghost ? "#fff" : INK);
       } });
     }
   }
@@ -215,7 +222,8 @@ const calibrationView = (function () {
   const plus2 = (p, way, by) => ({ x: p.x + by * Math.cos(way), y: p.y + by * Math.sin(way) });
 
   function beam(pen, see) {
-    const to = state.point >= 0 ? scene.points[state.point] : scene.robots.length ? scene.robots[state.robot].slice(-1)[0] : scene.tracker;
+    const body = scene.now || scene.robots[state.robot];
+    const to = state.point >= 0 ? scene.points[state.point] : body ? body[body.length - 1] : scene.tracker;
     const [a, b] = [see(scene.tracker), see(to)];
     return { depth: Math.max(a.depth, b.depth), paint: () => line(pen, a, b, "#c2410c", 1, [3, 3]) };
   }
@@ -231,8 +239,12 @@ const calibrationView = (function () {
 
   function caption(pen, height) {
     const which = good.filter(Boolean).length > MOST_ARROWS ? `, the ${MOST_ARROWS} largest` : "";
-    text(pen, `grid ${step} m · error vectors × ${state.factor}, ${state.when} calibration${which}`, 8, height - 9, SOFT);
+    const vectors = count ? ` · error vectors × ${state.factor}, ${state.when} calibration${which}` : "";
+    text(pen, `grid ${step} m${vectors}`, 8, height - 9, SOFT);
   }
 
-  return { data, scene, state, HOME, FACTORS, SHADES, draw, camera, top, errors, good, robotOf, usualFactor };
-})();
+  // What can be clicked: the measured points, and the targets of robots that are ahead; where it is, and what it stands for.
+  const places = [...scene.points.map((p, i) => ({ at: p, point: i })), ...ahead.map((i) => ({ at: targetOf(i), robot: i }))];
+
+  return { scene, state, HOME, FACTORS, SHADES, draw, camera, top, errors, good, places, robotOf, usualFactor };
+}
