@@ -5,6 +5,15 @@
 
 from calib_planner.report.calibration import InputFile, Provenance, provenance
 from calib_planner.report.page import write_report
-from calib_planner.report.plan_sheet import write_sheet, write_sheet_page
-from calib_planner.report.render import render
+from calib_planner.report.plan_sheet import posture_drawings, write_sheet, write_sheet_page
+from calib_planner.report.render import TEMPLATES, Drawing, embedded, render
 from calib_planner.report.robot_drawing import draw_robot
+from calib_planner.report.scene import (
+    REJECTED,
+    USED,
+    MeasuredPoints,
+    Scene,
+    bodies,
+    origin_of_points,
+    visits_scene,
+)

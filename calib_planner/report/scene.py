@@ -74,33 +74,83 @@ class Scene:
         return rounded
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredPoints:
+    """K points that were measured, in the frame of the measurements.
+
+    Attributes:
+        rows: (K,) configuration of each, from 0.
+        targets: (K,) target of each, from 1.
+        points: (K, 3) measured [m].
+        after, before: (K, 3) measured − predicted with the identified and with the nominal kinematics [m].
+        states: (K,) ``USED``, ``SUSPECT`` or ``REJECTED``.
+    """
+
+    rows: IntArray
+    targets: IntArray
+    points: FloatArray
+    after: FloatArray
+    before: FloatArray
+    states: IntArray
+
+
 def scene_of(problem: IdentificationProblem, estimate: Estimate, before: FloatArray) -> Scene:
     """The scene; ``before`` (N, targets, 3) measured − predicted with the nominal kinematics [m]."""
     data, known = problem.data, estimate.knowledge
     robot = known.placed
-    turn, place = robot.base_pose
     where = np.argwhere(data.seen)
     seen = tuple(where.T)
-    states = point_states(estimate)[seen]
-    size = np.linalg.norm(estimate.residuals.vectors[seen], axis=1)
-    worst = np.full(len(data), -1.0)
-    np.maximum.at(worst, where[:, 0], np.where(states == USED, size, np.inf))
+    points = MeasuredPoints(
+        rows=where[:, 0],
+        targets=where[:, 1] + 1,
+        points=data.p[seen],
+        after=estimate.residuals.vectors[seen],
+        before=before[seen],
+        states=point_states(estimate)[seen],
+    )
+    actual = known.actual(data.q, data.payload)
+    tests = known.actual(estimate.accuracy.test_poses.reshape(-1, len(robot.joint_names)))
+    return visits_scene(robot, data.q, points, actual, tests, _tracker(problem, *robot.base_pose))
+
+
+def visits_scene(
+    robot: Robot,
+    q: FloatArray,
+    measured: MeasuredPoints,
+    actual: FloatArray,
+    tests: FloatArray,
+    tracker: FloatArray | None,
+) -> Scene:
+    """The scene of configurations, of which some or none were measured.
+
+    Args:
+        robot: The robot, placed in the frame of the measurements.
+        q: (N, joints) configurations as the robot reads them [rad | m].
+        measured: The points.
+        actual: (N, joints) where its joints really are [rad | m]; ``q`` where that is not known.
+        tests: (T, joints) test poses, likewise.
+        tracker: (3,) where the tracker stood in the frame of the base [m], or ``None``.
+    """
+    turn, place = robot.base_pose
+    size = np.linalg.norm(measured.after, axis=1)
+    worst = np.full(len(q), -1.0)
+    np.maximum.at(worst, measured.rows, np.where(measured.states == USED, size, np.inf))
     rows = thinned(worst, MOST_ROBOTS)
     return Scene(
         joint_names=robot.joint_names,
         revolute=tuple(bool(r) for r in robot.joint_is_revolute),
-        q=data.q,
-        rows=where[:, 0],
-        targets=where[:, 1] + 1,
-        points=(data.p[seen] - place) @ turn,
-        after=estimate.residuals.vectors[seen] @ turn,
-        before=before[seen] @ turn,
-        states=states,
+        q=q,
+        rows=measured.rows,
+        targets=measured.targets,
+        points=(measured.points - place) @ turn,
+        after=measured.after @ turn,
+        before=measured.before @ turn,
+        states=measured.states,
         robot_rows=rows,
-        robots=bodies(robot, known.actual(data.q, data.payload)[rows]),
-        test_robots=bodies(robot, known.actual(estimate.accuracy.test_poses.reshape(-1, len(robot.joint_names)))),
+        robots=bodies(robot, actual[rows]),
+        test_robots=bodies(robot, tests),
         target_count=len(robot.targets),
-        tracker=_tracker(problem, turn, place),
+        tracker=tracker,
     )
 
 
@@ -142,10 +192,21 @@ def bodies(robot: Robot, q: FloatArray) -> FloatArray:
 def _tracker(problem: IdentificationProblem, turn: FloatArray, place: FloatArray) -> FloatArray | None:
     """From the instrument if it knows its station, else the origin of a frame that is not the base's own."""
     station = getattr(problem.instrument, "station", None)
+    if station is not None:
+        return np.asarray((np.asarray(station) - place) @ turn)
+    return origin_of_points(problem.robot, turn, place)
+
+
+def origin_of_points(robot: Robot, turn: FloatArray, place: FloatArray) -> FloatArray | None:
+    """(3,) origin of the frame of the points, in that of the base [m]: there the tracker stands.
+
+    ``None`` where the points are in the base's own frame: that is where the pose ``turn`` (3, 3), ``place`` (3,)
+    [m] of the base is none, and is not identified either.
+    """
     own = np.allclose(turn, np.eye(3), atol=1e-9) and np.allclose(place, 0.0, atol=1e-9)
-    if station is None and own and not any(p.role == BASE for p in problem.robot.parameters):
+    if own and not any(p.role == BASE for p in robot.parameters):
         return None
-    return np.asarray((np.zeros(3) if station is None else np.asarray(station)) - place) @ turn
+    return np.asarray(-place @ turn)
 
 
 # ── The scene from one side: for readers without JavaScript, such as mail programs on phones ─────────────────
