@@ -51,6 +51,8 @@ LARGEST_REQUEST = 4096
 """Bytes of what a button sends, at most."""
 PERIOD = 0.05
 """Least time between two messages to one client [s]: a tenth of a second is not seen as a delay."""
+PULSE = 4.0
+"""Longest time between two messages to one client [s], from which it knows that the node is there."""
 SILENCE = 20.0
 """Time that a client has to take a message before it is left [s]."""
 PATIENCE = 5.0
@@ -400,8 +402,8 @@ class PageServer(Generic[T]):
         has = -1
         try:
             while not client.closed and not self._end.is_set():
-                async with self._news:
-                    await self._news.wait_for(lambda: self._sections.newest > has or self._end.is_set())
+                with suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._newer(has), PULSE)
                 if self._end.is_set():
                     return
                 text, has = self._sections.since(has), self._sections.newest
@@ -409,6 +411,10 @@ class PageServer(Generic[T]):
                 await asyncio.sleep(PERIOD)
         except (asyncio.TimeoutError, ConnectionError):
             _drop(request)
+
+    async def _newer(self, has: int) -> None:
+        async with self._news:
+            await self._news.wait_for(lambda: self._sections.newest > has or self._end.is_set())
 
     async def _on_button(self, request: Any) -> Any:
         web = self._web

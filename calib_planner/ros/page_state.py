@@ -12,6 +12,7 @@ base, and the newest estimate says where that is. Until there is an estimate no 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
@@ -25,11 +26,14 @@ from calib_planner.arrays import FloatArray, plain
 from calib_planner.errors import InputError
 from calib_planner.report import (
     REJECTED,
+    TEMPLATES,
     USED,
     MeasuredPoints,
     bodies,
+    embedded,
     origin_of_points,
     posture_drawings,
+    render,
     visits_scene,
 )
 from calib_planner.robot import BASE, Robot
@@ -37,7 +41,9 @@ from calib_planner.units import counted, cut, joint_factor, joint_unit, milli, s
 
 MOST_VISITS, MOST_AHEAD, MOST_TARGETS = 2000, 300, 20
 """Measurements, configurations ahead, and targets of one measurement that the page keeps: the newest."""
-MOST_LINES, MOST_FINDINGS, MOST_STREAMS, MOST_HISTORY = 30, 30, 20, 500
+MOST_ROWS = 100
+"""Measurements in the list, the newest first."""
+MOST_LINES, MOST_REASONS, MOST_STREAMS, MOST_HISTORY = 30, 30, 20, 500
 LONGEST = 600
 """Characters of a text from a topic."""
 UNKNOWN = "–"
@@ -47,7 +53,7 @@ UNKNOWN = "–"
 # ── what was heard ───────────────────────────────────────────────────────────────────────────────────
 
 
-class Finding(NamedTuple):
+class Why(NamedTuple):
     """A reason of a verdict: PASS, WARN or FAIL, what it is, what to do."""
 
     level: str
@@ -132,7 +138,7 @@ class Campaign:
     q: tuple[float, ...]
     ahead: tuple[Ahead, ...]
     level: str
-    findings: tuple[Finding, ...]
+    reasons: tuple[Why, ...]
     reason: str
 
 
@@ -157,7 +163,7 @@ class Estimated:
     test_poses: tuple[tuple[float, ...], ...]
     joint_names: tuple[str, ...]
     level: str
-    findings: tuple[Finding, ...]
+    reasons: tuple[Why, ...]
     message: str
 
 
@@ -220,7 +226,7 @@ def on_status(state: PageState, message: CampaignStatus) -> PageState:
         rounds=tuple(zip(message.round_measured.tolist(), message.round_accuracy.tolist(), strict=False)),
         reason=cut(message.reason, LONGEST),
         level=LEVELS.get(message.verdict.level, ""),
-        findings=_findings(message.verdict),
+        reasons=_reasons(message.verdict),
         **{name: getattr(message, name) for name in _SAME},
     )
     before = state.campaign
@@ -230,7 +236,7 @@ def on_status(state: PageState, message: CampaignStatus) -> PageState:
     return state
 
 
-_OWN = {"id", "robot", "q", "joint_names", "ahead", "number", "rounds", "reason", "level", "findings"}
+_OWN = {"id", "robot", "q", "joint_names", "ahead", "number", "rounds", "reason", "level", "reasons"}
 _SAME = [f.name for f in fields(Campaign) if f.name not in _OWN]
 """Numbers that are the same in message and state."""
 
@@ -259,7 +265,7 @@ def on_estimate(state: PageState, message: CalibrationEstimate) -> PageState:
         test_poses=tuple(_joints("test_poses", c, joints) for c in message.test_poses[:MOST_AHEAD]),
         joint_names=joints,
         level=LEVELS.get(message.verdict.level, ""),
-        findings=_findings(message.verdict),
+        reasons=_reasons(message.verdict),
         message=cut(message.message, LONGEST),
     )
     history = state.history
@@ -343,10 +349,10 @@ def _joints(where: str, message: Any, names: Sequence[str], *, empty: bool = Fal
     raise InputError(where, f"{len(q)} joints", f"{len(names)} finite numbers, one per joint name")
 
 
-def _findings(verdict: Verdict) -> tuple[Finding, ...]:
+def _reasons(verdict: Verdict) -> tuple[Why, ...]:
     return tuple(
-        Finding(LEVELS.get(f.level, ""), cut(f.text, LONGEST), cut(f.advice, LONGEST))
-        for f in verdict.findings[:MOST_FINDINGS]
+        Why(LEVELS.get(f.level, ""), cut(f.text, LONGEST), cut(f.advice, LONGEST))
+        for f in verdict.reasons[:MOST_REASONS]
     )
 
 
@@ -362,7 +368,7 @@ class Button(NamedTuple):
         label: What stands on the button.
         hint: What happens.
         refused: Why it makes no sense now; empty if it does.
-        moves: Whether the robot may move: then the page asks once more.
+        sure: What the page asks before; empty if nothing.
     """
 
     part: str
@@ -370,7 +376,7 @@ class Button(NamedTuple):
     label: str
     hint: str
     refused: Callable[[PageState], str]
-    moves: bool = False
+    sure: str = ""
 
 
 S, F = CampaignStatus, ExecutePlan.Feedback
@@ -416,16 +422,19 @@ def _always(state: PageState) -> str:
     return ""
 
 
+MOVES = "The robot will move. Is its way free, and nobody near it?"
 BUTTONS = {
-    "start": Button("campaign", "start", "Start", "Begin a campaign", _no_start, True),
+    "start": Button("campaign", "start", "Start", "Begin a campaign", _no_start, MOVES),
     "pause": Button("campaign", "pause", "Pause", "The robot ends its move; nothing is lost", _no_pause),
-    "resume": Button("campaign", "resume", "Resume", "Go on", _no_resume, True),
+    "resume": Button("campaign", "resume", "Resume", "Go on", _no_resume, MOVES),
+    "confirm": Button("executor", "confirm", "Confirm", "The robot may make its next move", _no_confirm),
     "skip": Button("campaign", "skip", "Skip", "Leave out the present configuration", _no_skip),
-    "confirm": Button("executor", "confirm", "Confirm", "The robot may make its next move", _no_confirm, True),
-    "undo": Button("identifier", "undo", "Undo", "Withdraw the newest measurement", _no_undo),
+    "undo": Button(
+        "identifier", "undo", "Undo", "Withdraw the newest measurement", _no_undo, "Withdraw the newest measurement?"
+    ),
     "save": Button("identifier", "save", "Save", "Write measurements and estimate", _no_estimate),
-    "report": Button("identifier", "report", "Report", "Write the report and open it here", _no_estimate),
-    "stop": Button("executor", "stop", "STOP", "The robot stops; the campaign pauses", _always),
+    "report": Button("identifier", "report", "Report", "Write the report", _no_estimate),
+    "stop": Button("executor", "stop", "STOP", "The robot stops, the campaign pauses", _always),
     "skip_configuration": Button("campaign", "skip_configuration", "Leave out", "", _always),
 }
 """Name → button. ``skip_configuration`` stands beside every configuration that is ahead."""
@@ -443,12 +452,15 @@ def refusal(state: PageState, name: str) -> str:
 
 
 def service_of(state: PageState, name: str) -> str:
-    """The service of a button, as ``node/service``; without an executor STOP pauses the campaign."""
+    """The service that a button calls now: without an executor STOP pauses the campaign."""
+    service = service_name(state, name)
+    return service_name(state, "pause") if name == "stop" and service not in state.there else service
+
+
+def service_name(state: PageState, name: str) -> str:
+    """The service of a button, as ``node/service``."""
     button = BUTTONS[name]
-    service = f"{state.names.get(button.part, button.part)}/{button.service}"
-    if name == "stop" and service not in state.there:
-        return f"{state.names.get('campaign', 'campaign')}/pause"
-    return service
+    return f"{state.names.get(button.part, button.part)}/{button.service}"
 
 
 # ── sections: what the browser gets ──────────────────────────────────────────────────────────────────
@@ -488,11 +500,11 @@ KINDS = {
 def _now(state: PageState) -> dict[str, Any]:
     """What happens, in a sentence; which visit of how many; the posture."""
     campaign, there = state.campaign, state.there
-    name = state.names.get("campaign", "the campaign")
+    name = state.names.get("campaign", "campaign")
     if campaign is None or name not in there:
-        text = f"{name} is not there. What is shown is the last that was heard." if campaign else ""
-        kind = {"kind": "gone", "word": "away", "title": "The campaign's node is not there."}
-        return kind | {"reason": text or f"Start {name}: the page waits for it.", "done": 0, "total": 0}
+        text = "What is shown is the last that was heard of it. Its robot may still be moving." if campaign else ""
+        gone = {"kind": "gone", "word": "away", "title": f"{name} is not there.", "done": 0, "total": 0, "count": ""}
+        return gone | {"reason": text or "Start it: the page waits for it."}
     kind, word = KINDS.get(campaign.state, ("idle", "unknown"))
     done = campaign.measured + campaign.validated
     total = done + campaign.left + max(campaign.validation - campaign.validated, 0)
@@ -513,9 +525,25 @@ def _now(state: PageState) -> dict[str, Any]:
         title = OUTCOMES.get(campaign.outcome, OUTCOMES[S.OUTCOME_OPEN])
     else:
         title = "Nothing is under way."
-    count = {} if campaign.state in (S.IDLE, S.DONE) or not total else {"done": done, "total": total}
-    reason = campaign.reason[:1].upper() + campaign.reason[1:]
-    return {"kind": kind, "word": word, "title": title, "reason": reason, "done": done, "total": total, **count}
+    count: dict[str, Any] = {"done": 0, "total": 0, "count": ""}
+    if total and campaign.state != S.IDLE:
+        ended = campaign.state == S.DONE
+        text = f"{done} measured" if ended else f"visit {min(done + 1, total)} of about {total}"
+        text = f"about {total} visits" if campaign.state == S.PAUSED and not done else text
+        count = {"done": done, "total": done if ended else total, "count": text}
+    reason = SERVICE.sub(_pressed, campaign.reason)
+    reason = reason[:1].upper() + reason[1:]
+    return {"kind": kind, "word": word, "title": title, "reason": reason, **count}
+
+
+SERVICE = re.compile(r"(?:\bcall )?~/([a-z_]+)")
+"""How a text on a topic names a service."""
+
+
+def _pressed(named: re.Match[str]) -> str:
+    """The service as a person at the page knows it."""
+    button = BUTTONS.get(named[1])
+    return named[0] if button is None else f"press {button.label}"
 
 
 def _posture(state: PageState) -> dict[str, Any] | None:
@@ -601,22 +629,26 @@ def _visits(state: PageState) -> dict[str, Any]:
         row = len(state.visits)
         for i, a in enumerate(campaign.ahead):
             ahead.append({"number": a.number, "row": row + i, "joints": _shown(robot, a.q)})
-    done = []
-    for row, visit in enumerate(state.visits.values()):
-        sizes = [1e3 * math.hypot(*state.residuals[k][0]) for k in _keys(visit) if k in state.residuals]
-        done.append(
-            {
-                "number": visit.number,
-                "row": row,
-                "joints": _shown(robot, visit.q) if robot is not None and len(visit.q) == len(robot.joint_names) else [],
-                "kind": "good" if visit.status == Measurement.ACCEPTED else "bad",
-                "word": _fate(visit),
-                "residual": f"{max(sizes):.4f} mm" if sizes else UNKNOWN,
-                "reason": visit.reason,
-            }
-        )
-    can = {name: refusal(state, name) for name in ("skip_configuration",)}
-    return {"ahead": ahead, "done": done[::-1], "refused": can["skip_configuration"]}
+    done = [_measured(state, row, visit) for row, visit in enumerate(state.visits.values())]
+    refused = refusal(state, "skip_configuration")
+    return {"ahead": ahead, "done": done[: -MOST_ROWS - 1 : -1], "measured": len(done), "refused": refused}
+
+
+def _measured(state: PageState, row: int, visit: Visit) -> dict[str, Any]:
+    robot = state.robot
+    keys = ((visit.number, target) for target in range(len(visit.points)))
+    sizes = [1e3 * math.hypot(*state.residuals[k][0]) for k in keys if k in state.residuals]
+    known = robot is not None and len(visit.q) == len(robot.joint_names)
+    word = FATES.get(visit.status, "rejected")
+    return {
+        "number": visit.number,
+        "row": row,
+        "joints": _shown(robot, visit.q) if robot is not None and known else [],
+        "kind": "good" if visit.status == Measurement.ACCEPTED else "bad",
+        "word": "validation" if word == "used" and visit.validation else word,
+        "residual": f"{max(sizes):.4f} mm" if sizes else UNKNOWN,
+        "reason": visit.reason,
+    }
 
 
 FATES = {
@@ -624,15 +656,6 @@ FATES = {
     Measurement.REJECTED_OUTLIER: "outlier",
     Measurement.REJECTED_UNDONE: "withdrawn",
 }
-
-
-def _fate(visit: Visit) -> str:
-    word = FATES.get(visit.status, "rejected")
-    return "validation" if word == "used" and visit.validation else word
-
-
-def _keys(visit: Visit) -> list[tuple[int, int]]:
-    return [(visit.number, t) for t in range(len(visit.points))]
 
 
 def placed(robot: Robot, estimate: Estimated | None, targets: int) -> Robot:
@@ -715,8 +738,7 @@ def _streams(state: PageState) -> list[dict[str, str]]:
             "text": s.text,
             "rate": _value(s, "rate [Hz]", "Hz"),
             "age": _value(s, "age [s]", "s"),
-            "still": _value(s, "still [s]", "s"),
-            "moves": s.values.get("motion", ""),
+            "motion": s.values.get("motion", ""),
         }
         for s in state.streams
     ]
@@ -731,19 +753,12 @@ def _verdict(state: PageState) -> dict[str, Any] | None:
     """The campaign's verdict in the end, the newest estimate's before."""
     campaign, estimate = state.campaign, state.estimate
     if campaign is not None and campaign.state == S.DONE and campaign.level:
-        level, findings, title = campaign.level, campaign.findings, "Verdict of the campaign"
+        level, reasons, title = campaign.level, campaign.reasons, "Verdict of the campaign"
     elif estimate is not None and estimate.level:
-        level, findings, title = estimate.level, estimate.findings, "Verdict on what is measured so far"
+        level, reasons, title = estimate.level, estimate.reasons, "Verdict on what is measured so far"
     else:
         return None
-    return {"level": level, "title": title, "findings": [f._asdict() for f in findings]}
-
-
-MEANINGS = {
-    "PASS": "Nothing speaks against applying the calibration.",
-    "WARN": "Read the findings before you apply the calibration.",
-    "FAIL": "Do not apply the calibration. The findings say what to do.",
-}
+    return {"level": level, "title": title, "reasons": [f._asdict() for f in reasons]}
 
 
 def _buttons(state: PageState) -> dict[str, dict[str, Any]]:
@@ -794,3 +809,9 @@ def changed(before: PageState | None, after: PageState) -> Iterator[tuple[str, A
     for name, (make, names) in SECTIONS.items():
         if before is None or any(getattr(before, n) is not getattr(after, n) for n in names):
             yield name, plain(make(after))
+
+
+def page_text() -> str:
+    """The page as HTML, the same for every state."""
+    buttons = [{"name": n, **b._asdict()} for n, b in BUTTONS.items() if n not in ("stop", "skip_configuration")]
+    return render(TEMPLATES / "live.html", buttons=buttons, embedded=embedded)

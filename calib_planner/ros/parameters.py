@@ -226,6 +226,9 @@ STREAM_IN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Streams that the nodes subscribe to: best effort matches every publisher, reliable or not, and the queue holds
 five seconds at 1 kHz."""
 
+NEWEST_IN = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Streams of which only the newest message counts."""
+
 REQUESTS = QoSProfile(depth=100)
 """Requests: rclpy's depth of 10 loses some of a burst, whose clients then wait for ever."""
 

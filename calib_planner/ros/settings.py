@@ -322,6 +322,31 @@ class CampaignParameters(PlanParameters):
         return tuple(_numbers("test_poses", t.replace(",", " "), t, expected) for t in poses if t)
 
 
+@dataclass(frozen=True)
+class PageParameters(RobotParameters):
+    """Parameters of ``calibration_page``."""
+
+    robot: str = at_configure("", "name of a shipped robot, to be drawn; empty = the campaign's, if it is shipped")
+    host: str = at_configure(
+        "127.0.0.1", "address to listen at; 127.0.0.1 = this machine alone, 0.0.0.0 = every network, with a token"
+    )
+    port: int = at_configure(8470, "port to listen at; 0 = any, which the node logs", "", 0, 65535)
+    token: str = at_configure(
+        "",
+        "what a browser has to know, 16 letters or more; empty = nothing on this machine alone, else one is made "
+        "and logged",
+    )
+    report_folder: str = at_configure(
+        "", "folder of the reports that the page may show, the identifier's save_folder; empty = it shows none"
+    )
+    campaign: str = at_configure("calibration_campaign", "name of the campaign's node")
+    identifier: str = at_configure("calibration_identifier", "name of the identifier")
+    executor: str = at_configure(
+        "plan_executor", "name of the node with action ~/execute_plan and services ~/stop and ~/confirm"
+    )
+    joint_topics: tuple[str, ...] = at_configure(("joint_states",), "topics of the joint states")
+
+
 def _numbers(field: str, text: str, got: str, expected: str, count: int | None = None) -> tuple[float, ...]:
     """The finite numbers between the blanks of ``text``, ``count`` of them unless it is ``None``."""
     try:
@@ -339,6 +364,7 @@ NODES: dict[str, tuple[type[Any], str]] = {
     "simulator": (SimulatorParameters, "tracker_simulator"),
     "campaign": (CampaignParameters, "calibration_campaign"),
     "executor": (ExecutorParameters, "plan_executor"),
+    "page": (PageParameters, "calibration_page"),
 }
 """Name of the file in config → parameters and name of the node."""
 

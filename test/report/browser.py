@@ -90,8 +90,10 @@ class Browser:
         self._to, self._back, self._rest, self._number = to, back, b"", 0
         self.events: list[dict[str, Any]] = []
 
-    def open(self, page: Path, width: int = 1280, height: int = 900, *, javascript: bool = True) -> Tab:
-        """Load a page and wait until it has loaded."""
+    def open(
+        self, page: Path | str, width: int = 1280, height: int = 900, *, javascript: bool = True
+    ) -> Tab:
+        """Load a page, a file or an address, and wait until it has loaded."""
         target = self.ask("Target.createTarget", url="about:blank")["targetId"]
         session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         tab = Tab(self, session)
@@ -101,7 +103,7 @@ class Browser:
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
         )
         tab.ask("Emulation.setScriptExecutionDisabled", value=not javascript)
-        tab.ask("Page.navigate", url=page.resolve().as_uri())
+        tab.ask("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         self.wait(lambda: any(e["method"] == "Page.loadEventFired" for e in tab.events))
         return tab
 

@@ -32,7 +32,7 @@ from rclpy.subscription import Subscription
 from calib_planner.acquisition import stamp_of
 
 PERIOD = 0.01
-"""Time between two looks at the streams [s]."""
+"""Usual time between two looks at the streams [s]."""
 EVENTS_EVERY = 100
 """The events may run after every so many looks."""
 MOST_AT_ONCE = 1000
@@ -68,14 +68,17 @@ class StreamPoller:
         node: Makes the subscriptions and the timer.
         streams: The topics to listen to.
         qos: Quality of service of the subscriptions.
+        period: Time between two looks [s].
     """
 
-    def __init__(self, node: Node, streams: Sequence[Stream], qos: QoSProfile) -> None:
+    def __init__(
+        self, node: Node, streams: Sequence[Stream], qos: QoSProfile, period: float = PERIOD
+    ) -> None:
         self._node, self._qos, self._looks, self._group = node, qos, 0, _Unwoken()
         self._streams = list(streams)
         self._subscriptions = [self._subscribe(stream) for stream in streams]
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
-        node.create_timer(PERIOD, self.poll, clock=steady)
+        node.create_timer(period, self.poll, clock=steady)
 
     def _subscribe(self, stream: Stream) -> Subscription:
         events = SubscriptionEventCallbacks(message_lost=lambda event: stream.lost(event.total_count_change))
