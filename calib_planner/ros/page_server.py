@@ -55,6 +55,8 @@ PULSE = 4.0
 """Longest time between two messages to one client [s], from which it knows that the node is there."""
 SILENCE = 20.0
 """Time that a client has to take a message before it is left [s]."""
+FAREWELL = 1.0
+"""Time that a client has to agree to the end of its connection [s]."""
 PATIENCE = 5.0
 """Time that the server has to end [s]."""
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -381,7 +383,9 @@ class PageServer(Generic[T]):
         web = self._web
         if len(self._clients) >= MOST_CLIENTS:
             return web.Response(status=503, text=f"{MOST_CLIENTS} pages are open: close some.\n")
-        client = web.WebSocketResponse(heartbeat=SILENCE, max_msg_size=LARGEST_REQUEST, compress=False)
+        client = web.WebSocketResponse(
+            timeout=FAREWELL, heartbeat=SILENCE, max_msg_size=LARGEST_REQUEST, compress=False
+        )
         self._clients.add(client)
         sending = None
         try:
@@ -391,17 +395,17 @@ class PageServer(Generic[T]):
                 break  # a client of ours says nothing
         finally:
             self._clients.discard(client)
+            _drop(request)
             if sending is not None:
-                sending.cancel()
+                sending.cancel()  # before Python 3.12 wait_for may lose it: therefore the loop looks at _clients
                 with suppress(asyncio.CancelledError, Exception):
                     await sending
-            _drop(request)
         return client
 
     async def _send(self, client: Any, request: Any) -> None:
         has = -1
         try:
-            while not client.closed and not self._end.is_set():
+            while client in self._clients and not client.closed and not self._end.is_set():
                 with suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(self._newer(has), PULSE)
                 if self._end.is_set():
