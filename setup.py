@@ -143,6 +143,7 @@ setup(
         "test": ["pytest", "pytest-timeout", "hypothesis", "pin"],
         "docs": ["sphinx>=8.1", "myst-parser>=4", "furo"],
         "bags": ["rosbags"],
+        "page": ["aiohttp>=3.9"],
         "files": ["openpyxl"],
         "completion": ["shtab>=1.6"],
         "xacro": ["xacro>=2.1"],

@@ -36,8 +36,8 @@ KEYS = {
 }
 """Modules and their keys in rosdep's python.yaml that apt has on Ubuntu 24.04."""
 TEST_KEYS = {"ament_flake8", "python3-hypothesis", "python3-pytest", "python3-pytest-timeout"}
-EXTRAS = {"rosbags", "openpyxl", "xacro", "pinocchio", "dask", "distributed", "threadpoolctl", "shtab"}
-"""Without an apt package: nothing needs them, and they are not in package.xml."""
+EXTRAS = {"rosbags", "openpyxl", "xacro", "pinocchio", "dask", "distributed", "threadpoolctl", "shtab", "aiohttp"}
+"""Nothing needs them: they are not in package.xml."""
 
 
 def keys(kind: str) -> list[str]:

@@ -1,23 +1,23 @@
 """The web server of the page: an event loop in a thread of its own, which the node never waits for.
 
-*What comes in.* ``GET /`` is the page, ``GET /live`` a WebSocket that tells what changes, ``POST /do/NAME`` a button,
-``GET /report/NAME`` a written report. Nothing else is answered, and no other file is read.
+*What comes in.* ``GET /`` is the page, ``GET /live`` a WebSocket that tells what changes, ``POST /do/NAME`` a
+button, ``GET /report/NAME`` a written report. Nothing else is answered, and no other file is read.
 
-*What goes out.* ``show`` takes the newest state, from any thread, and returns at once. The loop makes the sections that
-changed (``changed``), once for all clients. A client has no queue: when it has taken what was sent last, it gets the
-sections that are newer than its own, in their newest form. A slow client thus gets fewer and larger messages, and one
-that does not read for ``SILENCE`` seconds is left.
+*What goes out.* ``show`` takes the newest state, from any thread, and returns at once. The loop makes the
+sections that changed (``changed``), once for all clients. A client has no queue: when it has taken what was sent
+last, it gets the sections that are newer than its own, in their newest form. A slow client thus gets fewer and
+larger messages, and one that does not read for ``SILENCE`` seconds is left.
 
 *Who may come.* A server that steers a robot is a target for every page that the same browser shows. Therefore
 
-* the name by which the server is called (``Host``) has to be its own, or a page could reach it by a name that it has
-  bound to this address (DNS rebinding);
+* the name by which the server is called (``Host``) has to be its own, or a page could reach it by a name that it
+  has bound to this address (DNS rebinding);
 * a button and a WebSocket need the header ``Origin`` of the page itself, which no page can forge;
 * beyond this machine a token is needed: once in the address, from then on as a cookie that no script reads.
 
 ``Access`` holds these rules as a pure value. The page's scripts and styles are named by their hashes in the
-Content-Security-Policy, so that nothing else runs, whatever a topic says. A report is shown in a sandbox: its scripts
-cannot press buttons.
+Content-Security-Policy, so that nothing else runs, whatever a topic says. A report is shown in a sandbox: its
+scripts cannot press buttons.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ SAFE = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 SANDBOX = (
-    "sandbox allow-scripts allow-modals; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    "sandbox allow-scripts allow-modals; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
 
 T = TypeVar("T")
@@ -123,7 +123,11 @@ class Access:
                 "leave it empty, and one is made",
             )
         local = is_local(host)
-        own = set() if local else {host.lower(), socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
+        own = (
+            set()
+            if local
+            else {host.lower(), socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
+        )
         made = token or ("" if local else secrets.token_urlsafe(24))
         return Access(frozenset({*LOOPBACK, *own}), local, made)
 
@@ -234,7 +238,8 @@ class PageServer(Generic[T]):
             raise CalibPlannerError(f"the page needs aiohttp: {advice}") from None
         self._web, self._body, self._policy = web, page.encode(), policy(page)
         self._access, self._changed, self._press, self._reports, self._say = access, changed, press, reports, say
-        self._sections, self._shown = Sections(), None
+        self._sections = Sections()
+        self._shown: T | None = None
         self._next: T | None = None
         self._due = threading.Lock()  # held from the first new state until the loop takes the newest
         self._clients: set[Any] = set()
@@ -349,7 +354,11 @@ class PageServer(Generic[T]):
             reason = access.wrong_host(called)
             if not reason and (request.method != "GET" or request.path == "/live"):
                 reason = access.wrong_origin(request.headers.get("Origin"), called)
-            if not reason and request.headers.get("Sec-Fetch-Site", "none") == "cross-site" and request.path != "/":
+            if (
+                not reason
+                and request.headers.get("Sec-Fetch-Site", "none") == "cross-site"
+                and request.path != "/"
+            ):
                 reason = access.wrong_origin("another site", called)
             given = request.query.get("token")
             cookie = f"calib_page_{self.port}"

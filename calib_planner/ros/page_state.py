@@ -1,9 +1,10 @@
 """What the page shows, as a pure value: messages go in, sections of plain values for the browser come out.
 
 ``PageState`` is what was heard. Each ``on_…`` takes a message and returns the state afterwards; what does not fit
-is refused there. ``SECTIONS`` says of each part of the page how it follows from which fields, so that only what has
-changed is made and sent again. Texts and numbers are written here, in the units of the report (mm and degrees), and
-the page's script puts them on the screen as they are. Nothing here needs a node, a server or a browser.
+is refused there. ``SECTIONS`` says of each part of the page how it follows from which fields, so that only what
+has changed is made and sent again. Texts and numbers are written here, in the units of the report (mm and
+degrees), and the page's script puts them on the screen as they are. Nothing here needs a node, a server or a
+browser.
 
 *Where a measured point is.* Points come in the frame of the tracker. The drawing is in the frame of the robot's
 base, and the newest estimate says where that is. Until there is an estimate no point is drawn.
@@ -36,7 +37,7 @@ from calib_planner.report import (
     render,
     visits_scene,
 )
-from calib_planner.robot import BASE, Robot
+from calib_planner.robot import Robot
 from calib_planner.units import counted, cut, joint_factor, joint_unit, milli, signed
 
 MOST_VISITS, MOST_AHEAD, MOST_TARGETS = 2000, 300, 20
@@ -175,7 +176,7 @@ class PageState:
         robot: The robot, as its description says.
         residuals: (number of the visit, target from 0) → measured − estimated [m], and whether it is used.
         history: (measurements, predicted accuracy [m]) of each estimate.
-        joints: Where the robot is now [rad | m], in the order of ``robot.joint_names``; empty if nothing is heard.
+        joints: Where the robot is now [rad | m], in the order of ``robot.joint_names``; empty before it is heard.
         there: Names of services that are offered, and of nodes that are there.
         names: Part (``campaign``, ``identifier``, ``executor``) → name of its node.
         waiting: Buttons whose answer has not come.
@@ -294,8 +295,7 @@ def on_measurement(state: PageState, message: Measurement) -> PageState:
     if not visit.number:
         return told(state, "bad", f"A standstill was not accepted: {visit.reason}") if visit.reason else state
     visits = {**state.visits, visit.number: visit}
-    kept = dict(list(visits.items())[-MOST_VISITS:])
-    return replace(state, visits=kept)
+    return replace(state, visits=dict(list(visits.items())[-MOST_VISITS:]))
 
 
 def on_residuals(state: PageState, message: Residuals) -> PageState:
@@ -308,8 +308,8 @@ def on_residuals(state: PageState, message: Residuals) -> PageState:
     if {len(message.targets), len(message.residuals), len(message.used)} != {count}:
         raise InputError("residuals", "lists of different lengths", f"{count} of each, as there are ids")
     rows = zip(message.ids, message.targets, message.residuals, message.used, strict=True)
-    found = {(int(i), int(t)): ((v.x, v.y, v.z), bool(used)) for i, t, v, used in rows}
-    return replace(state, residuals=dict(list(found.items())[-MOST_VISITS * MOST_TARGETS :]))
+    given = {(int(i), int(t)): ((v.x, v.y, v.z), bool(used)) for i, t, v, used in rows}
+    return replace(state, residuals=dict(list(given.items())[-MOST_VISITS * MOST_TARGETS :]))
 
 
 def on_diagnostics(state: PageState, message: DiagnosticArray) -> PageState:
@@ -430,7 +430,12 @@ BUTTONS = {
     "confirm": Button("executor", "confirm", "Confirm", "The robot may make its next move", _no_confirm),
     "skip": Button("campaign", "skip", "Skip", "Leave out the present configuration", _no_skip),
     "undo": Button(
-        "identifier", "undo", "Undo", "Withdraw the newest measurement", _no_undo, "Withdraw the newest measurement?"
+        "identifier",
+        "undo",
+        "Undo",
+        "Withdraw the newest measurement",
+        _no_undo,
+        "Withdraw the newest measurement?",
     ),
     "save": Button("identifier", "save", "Save", "Write measurements and estimate", _no_estimate),
     "report": Button("identifier", "report", "Report", "Write the report", _no_estimate),
@@ -502,8 +507,17 @@ def _now(state: PageState) -> dict[str, Any]:
     campaign, there = state.campaign, state.there
     name = state.names.get("campaign", "campaign")
     if campaign is None or name not in there:
-        text = "What is shown is the last that was heard of it. Its robot may still be moving." if campaign else ""
-        gone = {"kind": "gone", "word": "away", "title": f"{name} is not there.", "done": 0, "total": 0, "count": ""}
+        text = (
+            "What is shown is the last that was heard of it. Its robot may still be moving." if campaign else ""
+        )
+        gone = {
+            "kind": "gone",
+            "word": "away",
+            "title": f"{name} is not there.",
+            "done": 0,
+            "total": 0,
+            "count": "",
+        }
         return gone | {"reason": text or "Start it: the page waits for it."}
     kind, word = KINDS.get(campaign.state, ("idle", "unknown"))
     done = campaign.measured + campaign.validated
@@ -560,7 +574,13 @@ def _posture(state: PageState) -> dict[str, Any] | None:
     number = rows[0].number
     views = " and ".join(s.words for s in drawing.shapes if s.words)
     title = f"configuration {number}: {views} view of the robot"
-    return {"number": number, "size": drawing.size, "title": title, "shapes": shapes, "joints": _shown(robot, rows[0].q)}
+    return {
+        "number": number,
+        "size": drawing.size,
+        "title": title,
+        "shapes": shapes,
+        "joints": _shown(robot, rows[0].q),
+    }
 
 
 def _shown(robot: Robot, q: Sequence[float]) -> list[tuple[str, str]]:
@@ -685,7 +705,9 @@ def _scene(state: PageState) -> dict[str, Any] | None:
     visits = list(state.visits.values())
     ahead = campaign.ahead if campaign is not None and fits else ()
     middle = tuple(robot.joint_limits.mean(axis=1).tolist())
-    q = np.array([v.q if len(v.q) == joints else middle for v in visits] + [a.q for a in ahead]).reshape(-1, joints)
+    q = np.array([v.q if len(v.q) == joints else middle for v in visits] + [a.q for a in ahead]).reshape(
+        -1, joints
+    )
     estimate = state.estimate
     tests: FloatArray = np.empty((0, joints))
     if estimate is not None and estimate.test_poses and estimate.joint_names == robot.joint_names:
@@ -696,7 +718,7 @@ def _scene(state: PageState) -> dict[str, Any] | None:
 
 
 def _points(state: PageState, visits: Sequence[Visit]) -> MeasuredPoints:
-    """The points of the visits that were seen, with their residuals; those of rejected standstills are left out."""
+    """The points that were seen, with their residuals; those of rejected standstills are left out."""
     rows = []
     for row, visit in enumerate(visits):
         if visit.status not in (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER):
@@ -775,11 +797,18 @@ def _page(state: PageState) -> dict[str, Any]:
     names = () if campaign is None else campaign.joint_names
     notice = ""
     if campaign is not None and names and robot is None:
-        notice = f"The page does not know {campaign.robot}: set its parameter robot, or publish robot_description."
+        notice = (
+            f"The page does not know {campaign.robot}: set its parameter robot, or publish robot_description."
+        )
     elif robot is not None and names and names != robot.joint_names:
         notice = f"The page draws {robot.name}, and the campaign measures {campaign.robot if campaign else ''}."
     name = campaign.robot if campaign is not None and campaign.robot else robot.name if robot is not None else ""
-    return {"robot": name, "campaign": "" if campaign is None else campaign.id, "notice": notice, "report": state.report}
+    return {
+        "robot": name,
+        "campaign": "" if campaign is None else campaign.id,
+        "notice": notice,
+        "report": state.report,
+    }
 
 
 def _journal(state: PageState) -> list[dict[str, Any]]:

@@ -326,7 +326,9 @@ class CampaignParameters(PlanParameters):
 class PageParameters(RobotParameters):
     """Parameters of ``calibration_page``."""
 
-    robot: str = at_configure("", "name of a shipped robot, to be drawn; empty = the campaign's, if it is shipped")
+    robot: str = at_configure(
+        "", "name of a shipped robot, to be drawn; empty = the campaign's, if it is shipped"
+    )
     host: str = at_configure(
         "127.0.0.1", "address to listen at; 127.0.0.1 = this machine alone, 0.0.0.0 = every network, with a token"
     )

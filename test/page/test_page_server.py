@@ -64,9 +64,11 @@ def make(tmp_path: Path) -> Iterator[Made]:
 def ask(
     server: PageServer[int], method: str, path: str, body: str | None = None, **headers: str
 ) -> tuple[int, dict[str, str], str]:
-    """Status, headers and text; ``Host`` and, for a POST, ``Origin`` are those of the page unless given (``""``: none)."""
+    """Status, headers and text; ``Host`` and ``Origin`` of a POST are the page's unless given (empty: none)."""
     own = f"127.0.0.1:{server.port}"
-    usual = {"Host": own} | ({"Origin": f"http://{own}", "Content-Type": "application/json"} if method == "POST" else {})
+    usual = {"Host": own} | (
+        {"Origin": f"http://{own}", "Content-Type": "application/json"} if method == "POST" else {}
+    )
     usual |= {name.replace("_", "-"): value for name, value in headers.items()}
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
     connection.putrequest(method, path, skip_host=True)
@@ -91,7 +93,7 @@ def ask(
      ("127.0.0.1", "LOCALHOST:1", True), ("127.0.0.1", "evil.example:8470", False), ("127.0.0.1", "", False),
      ("127.0.0.1", "192.168.0.7:8470", False), ("127.0.0.1", "localhost.evil.example", False),
      ("127.0.0.1", "[:", False), ("127.0.0.1", "evil@127.0.0.1:80", True), ("0.0.0.0", "192.168.0.7:8470", True),
-     ("0.0.0.0", "[fe80::1]:80", True), ("0.0.0.0", "evil.example", False), ("cell.local", "cell.local:8470", True),
+     ("0.0.0.0", "[fe80::1]:80", True), ("0.0.0.0", "evil.example", False), ("cell.local", "cell.local:1", True),
      ("0.0.0.0", f"{socket.gethostname()}:8470", True)],
 )  # fmt: skip
 def test_by_which_names_it_may_be_called(host: str, header: str, fine: bool) -> None:
@@ -103,8 +105,11 @@ def test_which_servers_are_for_this_machine_alone() -> None:
     assert not any(map(is_local, ("0.0.0.0", "::", "192.168.0.1", "cell.local", "")))
 
 
-@pytest.mark.parametrize("origin", [None, "", "null", "http://evil.example", "https://127.0.0.1:8470",
-                                    "http://127.0.0.1:8471", "http://127.0.0.1", "http://127.0.0.1:8470.evil.example"])  # fmt: skip
+@pytest.mark.parametrize(
+    "origin",
+    [None, "", "null", "http://evil.example", "https://127.0.0.1:8470", "http://127.0.0.1:8471", "http://127.0.0.1",
+     "http://127.0.0.1:8470.evil.example"],
+)  # fmt: skip
 def test_other_origins_are_refused(origin: str | None) -> None:
     access = Access.of("127.0.0.1", "")
     assert access.wrong_origin(origin, "127.0.0.1:8470") and not access.wrong_origin("http://a:1", "a:1")
@@ -124,7 +129,12 @@ def test_every_way_in_asks_for_host_origin_and_token(make: Made) -> None:
     server = make(token=TOKEN)
     cookie = {"Cookie": f"calib_page_{server.port}={TOKEN}"}
     own = {"Host": f"127.0.0.1:{server.port}", "Origin": f"http://127.0.0.1:{server.port}"}
-    ways = [("GET", "/", None), ("GET", "/live", None), ("POST", "/do/start", "{}"), ("GET", "/report/report_a.html", None)]
+    ways = [
+        ("GET", "/", None),
+        ("GET", "/live", None),
+        ("POST", "/do/start", "{}"),
+        ("GET", "/report/report_a.html", None),
+    ]
     for method, path, body in ways:
         assert ask(server, method, path, body, **own)[0] == 403, path
         assert ask(server, method, path, body, **own, Cookie="calib_page_1=x")[0] == 403, path
@@ -164,9 +174,9 @@ def test_what_a_browser_is_told(make: Made) -> None:
 
 @pytest.mark.parametrize(
     ("path", "status"),
-    [("/do/start", 405), ("/nothing", 404), ("/../etc/passwd", 404), ("/report/", 404), ("/report/other.html", 404),
-     ("/report/report_a.html", 404), ("/report/%2e%2e%2freport_a.html", 404), ("/report/report_..html", 404),
-     ("/report/report_a.html%00", 404), ("/report/folder", 404), ("/favicon.ico", 404)],
+    [("/do/start", 405), ("/nothing", 404), ("/../etc/passwd", 404), ("/report/", 404), ("/report/folder", 404),
+     ("/report/other.html", 404), ("/report/report_a.html", 404), ("/report/%2e%2e%2freport_a.html", 404),
+     ("/report/report_..html", 404), ("/report/report_a.html%00", 404), ("/favicon.ico", 404)],
 )  # fmt: skip
 def test_nothing_else_is_served(make: Made, tmp_path: Path, path: str, status: int) -> None:
     (tmp_path / "report_folder.html").mkdir()
@@ -179,7 +189,11 @@ def test_a_report_cannot_press_buttons(make: Made, tmp_path: Path) -> None:
     status, headers, text = ask(make(), "GET", "/report/report_a-fit.html")
     assert (status, text) == (200, "report")
     rules = headers["content-security-policy"]
-    assert rules.startswith("sandbox allow-scripts") and "allow-same-origin" not in rules and "connect-src" not in rules
+    assert (
+        rules.startswith("sandbox allow-scripts")
+        and "allow-same-origin" not in rules
+        and "connect-src" not in rules
+    )
 
 
 # ── buttons ──────────────────────────────────────────────────────────────────────────────────────────
@@ -187,7 +201,10 @@ def test_a_report_cannot_press_buttons(make: Made, tmp_path: Path) -> None:
 
 def test_a_button_gets_the_answer(make: Made) -> None:
     server = make()
-    assert json.loads(ask(server, "POST", "/do/start", '{"number": 3}')[2]) == {"done": True, "text": "start {'number': 3}"}
+    assert json.loads(ask(server, "POST", "/do/start", '{"number": 3}')[2]) == {
+        "done": True,
+        "text": "start {'number': 3}",
+    }
     assert json.loads(ask(server, "POST", "/do/pause", "{}")[2])["done"] is False
     status, _, text = ask(server, "POST", "/do/wrong", "{}")
     assert status == 400 and "expected start" in text.replace("valid is", "expected")
@@ -196,7 +213,8 @@ def test_a_button_gets_the_answer(make: Made) -> None:
 
 @pytest.mark.parametrize(
     ("body", "kind", "status"),
-    [("{}", "text/plain", 415), ("[]", "application/json", 400), ("{", "application/json", 400), ("", "application/json", 400),
+    [("{}", "text/plain", 415), ("[]", "application/json", 400), ("{", "application/json", 400),
+     ("", "application/json", 400),
      ('{"a": "' + 5000 * "x" + '"}', "application/json", 413), ("{}", "application/x-www-form-urlencoded", 415),
      (400 * "[" , "application/json", 400), ('{"a": NaN}', "application/json", 200)],
 )  # fmt: skip

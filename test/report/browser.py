@@ -90,9 +90,7 @@ class Browser:
         self._to, self._back, self._rest, self._number = to, back, b"", 0
         self.events: list[dict[str, Any]] = []
 
-    def open(
-        self, page: Path | str, width: int = 1280, height: int = 900, *, javascript: bool = True
-    ) -> Tab:
+    def open(self, page: Path | str, width: int = 1280, height: int = 900, *, javascript: bool = True) -> Tab:
         """Load a page, a file or an address, and wait until it has loaded."""
         target = self.ask("Target.createTarget", url="about:blank")["targetId"]
         session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]

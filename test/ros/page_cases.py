@@ -10,10 +10,10 @@ from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import (
     CalibrationEstimate,
     CampaignStatus,
-    Reason,
     JointConfiguration,
     Measurement,
     Plan,
+    Reason,
     Residuals,
     Verdict,
 )
@@ -54,7 +54,7 @@ class Script:
         """After ``done`` of the configurations."""
         ahead = list(range(done, min(COUNT, done + 6 if done else COUNT)))
         accuracy = self.accuracy(done)
-        rounds = [n for n in range(6, done + 1, 4)]
+        rounds = list(range(6, done + 1, 4))
         message = S(
             campaign_id="c0ffee12",
             robot=self.robot.name,
@@ -111,7 +111,9 @@ class Script:
         finding = Reason(
             level=level,
             text="Visits left out are predicted to 0.0613 mm, as the error model says.",
-            advice="" if level == Verdict.PASS else "Measure more configurations before you apply the calibration.",
+            advice=""
+            if level == Verdict.PASS
+            else "Measure more configurations before you apply the calibration.",
         )
         return CalibrationEstimate(
             robot=self.robot.name,
@@ -141,7 +143,10 @@ class Script:
         )
 
     def diagnostics(self) -> DiagnosticArray:
-        rows = (("joint_states", b"\0", "100 Hz", "stands still, 1.4 s"), ("tracker/point", b"\1", "no point for 3 s", "moves"))
+        rows = (
+            ("joint_states", b"\0", "100 Hz", "stands still, 1.4 s"),
+            ("tracker/point", b"\1", "no point for 3 s", "moves"),
+        )
         status = [
             DiagnosticStatus(
                 name=f"calibration_identifier: stream {name}",
@@ -154,14 +159,16 @@ class Script:
         return DiagnosticArray(status=status)
 
     def state(self, kind: str) -> PageState:
-        """The page's state ``before`` the first start, in ``review``, ``running``, ``confirm``, ``done`` or ``gone``."""
+        """The page's state: ``before``, ``review``, ``running``, ``confirm``, ``done`` or ``gone``."""
         services = [f"{NAMES[b.part]}/{b.service}" for b in ps.BUTTONS.values()]
         state = PageState(names=NAMES, there=frozenset([*services, *NAMES.values()]), robot=self.robot)
         state = ps.on_diagnostics(replace(state, joints=tuple(self.q[0])), self.diagnostics())
         if kind == "before":
             return ps.on_status(state, S(state=S.IDLE, reason="call ~/start"))
         if kind == "review":
-            return ps.on_status(state, self.status(S.PAUSED, 0, reason="look at the plan; ~/resume begins to measure"))
+            return ps.on_status(
+                state, self.status(S.PAUSED, 0, reason="look at the plan; ~/resume begins to measure")
+            )
         done = COUNT if kind == "done" else 9
         for i in range(done):
             state = ps.on_measurement(state, self.measurement(i))
@@ -170,15 +177,24 @@ class Script:
         state = ps.on_residuals(state, self.residuals(done))
         state = ps.on_measurement(
             state,
-            self.measurement(3, status=Measurement.REJECTED_OUTLIER, reason="9.1 standard deviations off: check the seat"),
+            self.measurement(
+                3, status=Measurement.REJECTED_OUTLIER, reason="9.1 standard deviations off: check the seat"
+            ),
         )
         state = replace(state, joints=tuple((self.q[done - 1] + self.q[min(done, COUNT - 1)]) / 2))
-        for text in ("Start: campaign c0ffee12 of kuka_kr270 begun", "Resume: goes on", "Skip: configuration 4 is left out"):
+        for text in (
+            "Start: campaign c0ffee12 of kuka_kr270 begun",
+            "Resume: goes on",
+            "Skip: configuration 4 is left out",
+        ):
             state = ps.told(state, "good", text, 1.79e9 + len(text))
         if kind == "done":
             verdict = self.estimate(16).verdict
             verdict.reasons.append(
-                Reason(level=Verdict.PASS, text="4 configurations for validation agree: 0.0582 mm rms, 0.0641 mm predicted.")
+                Reason(
+                    level=Verdict.PASS,
+                    text="4 configurations for validation agree: 0.0582 mm rms, 0.0641 mm predicted.",
+                )
             )
             return ps.on_status(
                 replace(state, report="report_c0ffee12-fit.html"),

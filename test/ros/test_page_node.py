@@ -23,10 +23,10 @@ from std_srvs.srv import Trigger
 
 pytest.importorskip("aiohttp", reason="the page needs aiohttp (extra page)")
 sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
-from browser import Browser, Tab, browser  # noqa: E402
+from browser import Browser, Tab, browser
 
-from calib_planner.ros.nodes.page import PageNode  # noqa: E402
-from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_OUT  # noqa: E402
+from calib_planner.ros.nodes.page import PageNode
+from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_OUT
 
 S = CampaignStatus
 
@@ -123,7 +123,8 @@ def test_what_is_pressed_is_called_and_answered(bench: Bench, others: Others, pa
 @pytest.mark.parametrize(
     ("name", "values"),
     [("apply", {}), ("skip_configuration", {}), ("skip_configuration", {"number": -1, "replace": True}),
-     ("skip_configuration", {"number": True, "replace": True}), ("skip_configuration", {"number": 3, "replace": 1})],
+     ("skip_configuration", {"number": True, "replace": True}),
+     ("skip_configuration", {"number": 3, "replace": 1})],
 )  # fmt: skip
 def test_what_no_button_sends_is_refused(page: PageNode, others: Others, name: str, values: Any) -> None:
     code, text = request(f"{page.url}do/{name}", values)
@@ -166,7 +167,14 @@ def test_reports_of_the_folder_are_shown_in_a_sandbox(bench: Bench, others: Othe
     (tmp_path / "report_link.html").symlink_to(tmp_path / "secret.html")
     page = bench.start(PageNode, port=0, report_folder=str(tmp_path))
     assert request(f"{page.url}report/report_a-fit.html") == (200, "<h1>report</h1>")
-    for name in ("secret.html", "report_link.html", "report_b.html", "..%2fsecret.html", "%2e%2e/secret.html", ""):
+    for name in (
+        "secret.html",
+        "report_link.html",
+        "report_b.html",
+        "..%2fsecret.html",
+        "%2e%2e/secret.html",
+        "",
+    ):
         assert request(f"{page.url}report/{name}")[0] == 404, name
     bench.wait(lambda: len(page._state.there) == 11)
     others.refuse = ""
@@ -249,7 +257,9 @@ def test_a_campaign_by_clicks_alone(
     click(tab, "#stop")
     bench.wait(lambda: others.calls[-1].endswith("plan_executor/stop"))
 
-    others.status.publish(script.status(S.DONE, COUNT, outcome=S.OUTCOME_REACHED, verdict=script.estimate(16).verdict))
+    others.status.publish(
+        script.status(S.DONE, COUNT, outcome=S.OUTCOME_REACHED, verdict=script.estimate(16).verdict)
+    )
     until(bench, tab, text("level"), lambda t: t == "PASS")
     assert "required accuracy is reached" in tab.run(f"return {text('title')};")
     assert tab.problems == []

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from calib_planner.io import config_folder
 from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
+from calib_planner.ros.nodes.page import PageNode
 from calib_planner.ros.nodes.planner import PlannerNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
 
@@ -24,6 +25,7 @@ NODES = {
     "/calib_planner/identifier": IdentifierNode,
     "/calib_planner/simulator": SimulatorNode,
     "/calib_planner/campaign": CampaignNode,
+    "/calib_planner/page": PageNode,
 }
 
 

@@ -1,8 +1,8 @@
 """Node ``calibration_page``: a web page to watch and steer a campaign, for any browser, also a phone's.
 
 What the other nodes publish becomes a ``PageState`` (``ros/page_state.py``), which the web server shows
-(``ros/page_server.py``). What is pressed becomes a call of their services, and the answer goes back to who pressed. The
-server has a thread of its own: the node hands it the newest state and goes on, whatever the browsers do.
+(``ros/page_server.py``). What is pressed becomes a call of their services, and the answer is shown. The server
+has a thread of its own: the node hands it the newest state and goes on, whatever the browsers do.
 
 The node takes no part in the campaign: it may be started and ended at any time, and several may run.
 """
@@ -56,7 +56,7 @@ SLOW = ("save", "report")
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class Pending:
     """A call that is under way: whose answer it is, and how long it is waited for."""
 
     name: str
@@ -86,7 +86,7 @@ class PageNode(ManagedNode[PageParameters]):
         self._state = PageState(names=names)
         self._described = False
         self._pressed: SimpleQueue[tuple[str, Mapping[str, Any], Future[Answer]]] = SimpleQueue()
-        self._calls: list[Asked] = []
+        self._calls: list[Pending] = []
         self._joints: dict[str, float] = {}
         self._heard = 0.0
         if chosen.robot:
@@ -138,8 +138,8 @@ class PageNode(ManagedNode[PageParameters]):
 
     def deactivate(self) -> None:
         """Answer what is pressed with a refusal from now on; the page stays."""
-        for asked in self._calls:
-            self._answer(asked, Answer(False, "the page's node was deactivated before the answer came"))
+        for pending in self._calls:
+            self._answer(pending, Answer(False, "the page's node was deactivated before the answer came"))
         self._calls = []
 
     # ── what is heard ────────────────────────────────────────────────────────────────────────────────
@@ -203,10 +203,10 @@ class PageNode(ManagedNode[PageParameters]):
         if time.monotonic() - self._heard > SILENT:
             state = page_state.on_feedback(state, None)
         self._set(state)
-        for asked in [a for a in self._calls if time.monotonic() > a.until]:
-            asked.client.remove_pending_request(asked.call)
+        for pending in [a for a in self._calls if time.monotonic() > a.until]:
+            pending.client.remove_pending_request(pending.call)
             text = "no answer came, and nobody knows whether it was done: see what is shown, then try again"
-            self._answer(asked, Answer(False, text))
+            self._answer(pending, Answer(False, text))
 
     # ── what is pressed ──────────────────────────────────────────────────────────────────────────────
 
@@ -259,33 +259,33 @@ class PageNode(ManagedNode[PageParameters]):
         if name == "skip_configuration":
             request = SkipConfiguration.Request(configuration_index=values["number"], replace=values["replace"])
         patience = LONG_PATIENCE if name in SLOW else PATIENCE
-        asked = Asked(name, answer, client.call_async(request), client, time.monotonic() + patience)
-        self._calls.append(asked)
+        pending = Pending(name, answer, client.call_async(request), client, time.monotonic() + patience)
+        self._calls.append(pending)
         self._set(replace(state, waiting=state.waiting | {name}))
-        asked.call.add_done_callback(lambda _: self._answered(asked))
+        pending.call.add_done_callback(lambda _: self._answered(pending))
 
-    def _answered(self, asked: Asked) -> None:
-        if asked.answer.done():
+    def _answered(self, pending: Pending) -> None:
+        if pending.answer.done():
             return
-        error = asked.call.exception()
-        response = asked.call.result() if error is None else None
+        error = pending.call.exception()
+        response = pending.call.result() if error is None else None
         if response is None:
-            self._answer(asked, Answer(False, f"no answer: {error}"))
+            self._answer(pending, Answer(False, f"no answer: {error}"))
             return
         done = response.success if hasattr(response, "success") else response.status == response.SUCCESS
-        self._answer(asked, Answer(bool(done), cut(response.message, 500)))
+        self._answer(pending, Answer(bool(done), cut(response.message, 500)))
 
-    def _answer(self, asked: Asked, answer: Answer) -> None:
+    def _answer(self, pending: Pending, answer: Answer) -> None:
         """Tell who pressed, and everybody's log."""
-        if asked in self._calls:
-            self._calls.remove(asked)
+        if pending in self._calls:
+            self._calls.remove(pending)
         state = replace(self._state, waiting=frozenset(a.name for a in self._calls))
-        text = f"{BUTTONS[asked.name].label}: {answer.text}"
-        if asked.name == "report" and answer.done:
+        text = f"{BUTTONS[pending.name].label}: {answer.text}"
+        if pending.name == "report" and answer.done:
             state = replace(state, report=self._report_of(answer.text))
         self._set(page_state.told(state, "good" if answer.done else "bad", text, time.time()))
-        if not asked.answer.done():
-            asked.answer.set_result(answer)
+        if not pending.answer.done():
+            pending.answer.set_result(answer)
 
     def _report_of(self, text: str) -> str:
         """The name of the report that an answer names, if the page may show it; else empty."""

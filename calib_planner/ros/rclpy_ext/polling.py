@@ -71,9 +71,7 @@ class StreamPoller:
         period: Time between two looks [s].
     """
 
-    def __init__(
-        self, node: Node, streams: Sequence[Stream], qos: QoSProfile, period: float = PERIOD
-    ) -> None:
+    def __init__(self, node: Node, streams: Sequence[Stream], qos: QoSProfile, period: float = PERIOD) -> None:
         self._node, self._qos, self._looks, self._group = node, qos, 0, _Unwoken()
         self._streams = list(streams)
         self._subscriptions = [self._subscribe(stream) for stream in streams]
