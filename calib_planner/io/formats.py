@@ -46,7 +46,7 @@ REFUSED: tuple[tuple[bytes, str, str], ...] = (
 
 
 READERS: tuple[tuple[Callable[[bytes], bool], Callable[[str | Path, bytes, str], RawLines]], ...] = (
-    (lambda data: _archive_with(data, b"[Content_Types].xml") or _is_archive(data) and b"xl/" in data, read_xlsx),
+    (lambda data: _archive_with(data, b"[Content_Types].xml", b"xl/workbook"), read_xlsx),
     (lambda data: _archive_with(data, b".npy"), lambda path, data, what: read_npz(path, data)),
     (lambda data: data.startswith(b"\x93NUMPY"), lambda path, data, what: read_npy(path, data)),
     (lambda data: data.startswith(b"MATLAB 5.0"), lambda path, data, what: read_mat(path, data)),
@@ -104,6 +104,6 @@ def _is_archive(data: bytes) -> bool:
     return data.startswith(b"PK\x03\x04")
 
 
-def _archive_with(data: bytes, name: bytes) -> bool:
-    """Whether it is one that names such a file, or part of a name, near its start."""
-    return _is_archive(data) and name in data[: 1 << 16]
+def _archive_with(data: bytes, *parts: bytes) -> bool:
+    """Whether it is one with a file whose name holds one of these; names stand at its start and at its end."""
+    return _is_archive(data) and any(part in data[: 1 << 16] or part in data[-(1 << 16) :] for part in parts)
