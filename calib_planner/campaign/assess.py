@@ -231,4 +231,5 @@ def round_of(state: CampaignState, known: Assessment | None, planned: int, note:
         forecast(known, state.problem.required_accuracy),
         planned,
         note,
+        known.estimate.left_out.rms,
     )

@@ -246,6 +246,8 @@ class Round:
         left: Forecast of measurements still needed; infinite: it cannot be reached.
         planned: Measurements planned next.
         note: What was decided, in words.
+        left_out: Root mean square distance of a point from where all other configurations predict it [m]; NaN
+            where nothing was identified.
     """
 
     number: int
@@ -257,6 +259,7 @@ class Round:
     left: float
     planned: int
     note: str
+    left_out: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,6 +164,11 @@ class CampaignState:
             return Measure(index, self.configurations[index].q, self.configurations[index].role, done)
         return Replan() if self.phase == FIT else Validate()
 
+    @property
+    def ahead(self) -> tuple[int, ...]:
+        """Numbers of the configurations to be visited next, one entry a visit, without the visit under way."""
+        return self.queue if self.paused else self.queue[1:]
+
     def measurements_of(self, role: str) -> tuple[Measurement, ...]:
         """Measurements for the fit, or for the validation."""
         return tuple(r for r in self.measurements if self.configurations[r.index].role == role)
@@ -269,10 +274,21 @@ class CampaignState:
         self._check_index(index)
         return self._exclude(index, reason, requested=False)
 
-    def skipped(self, index: int, reason: str = "skipped on request") -> CampaignState:
-        """A person does not want the robot there."""
+    def skipped(
+        self, index: int, reason: str = "skipped on request", *, replan: bool = False
+    ) -> CampaignState:
+        """A person does not want the robot there.
+
+        Args:
+            index: Number of the configuration.
+            reason: Why, in words.
+            replan: Whether the visits that are still ahead are planned anew around it; a visit that is under way
+                is made all the same.
+        """
         self._check_index(index)
-        return self._exclude(index, reason, requested=True)
+        under_way = () if self.paused else self.queue[:1]
+        state = self._exclude(index, reason, requested=True)
+        return replace(state, queue=tuple(i for i in under_way if i in state.queue)) if replan else state
 
     def pause(self) -> CampaignState:
         """Send the robot nowhere from now on."""

@@ -80,6 +80,7 @@ if TYPE_CHECKING:
         OUTLIER,
         UNDONE,
         CampaignStore,
+        NamedPlan,
         Record,
         SessionStore,
         StoredModel,
@@ -123,7 +124,7 @@ else:
             "sizes": "angle_factors",
             "sources": "Sources read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
-            "SessionStore CampaignStore Record StoredSession StoredModel UnavailableStore begin_campaign "
+            "SessionStore CampaignStore NamedPlan Record StoredSession StoredModel UnavailableStore begin_campaign "
             "open_campaign open_store stored_model",
             "text": "check_writable fresh_folder make_folder read_text user_path write_text",
             "understanding": "BagTopics JointTable Reading Source Understanding",

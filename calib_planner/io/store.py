@@ -2,10 +2,12 @@
 
 *The store* of an identifier, ``campaign.sqlite`` in a folder that the user chose; without a folder the same in
 memory. Its tables only grow. A *standstill* is raw data and never changes. What was decided about it is a row of
-the log ``decisions``: a later decision replaces an earlier one, and both stay. A *record* is a standstill with
-its last decision, and a *session* is a plan with the records under it (table ``campaigns``). Only the pointer to
-the current session moves, and a session in which nothing was measured gives way to the next. The model's source
-text, the settings and the version of the package that wrote are kept beside.
+the log ``decisions``: a later decision replaces an earlier one, and both stay. The *role* of a standstill, fit or
+validation, is part of the decision. A *record* is a standstill with its last decision. A *session* (table
+``campaigns``) is what was measured of one campaign, under however many plans, or of one plan that is part of no
+campaign; table ``plans`` says which plans were taken, the newest last. Only the pointer to the current session
+moves, and a session in which nothing was measured gives way to the next. The model's source text, the settings and
+the version of the package that wrote are kept beside.
 
 SQLite writes ahead with ``synchronous=FULL``: a commit that returned survives ``kill -9`` and a power cut, one
 that did not leaves nothing behind. ``locking_mode=EXCLUSIVE`` keeps a second process out and needs no file of
@@ -14,21 +16,24 @@ is refused and left as it is. When the disk is full or gone, ``StoreError`` says
 next attempt may succeed.
 
 *The record of a campaign*, ``adaptive_campaign.sqlite``, has the same tables and a lock of its own, because two
-nodes may share a folder. A campaign is a row of ``campaigns``, its requirements are a row of ``settings``. Its
-measurements are standstills, of which only joints and points are known, with the number under which the
-identifier published them (``told``); the role, fit or validation, is part of the decision. What else happened is
-an event, a JSON object. The state is rebuilt by ``from_measurements``: what was planned and not measured is
-planned anew.
+nodes may share a folder. A campaign is a row of ``campaigns``; what it has to reach, and within which budget, is
+a row of ``settings``: the names of parameters with their values. Its measurements are standstills, of which only
+joints and points are known, with the number under which the identifier published them (``told``). What else
+happened is an event, a JSON object. The state is rebuilt by ``from_measurements``: what was planned and not
+measured is planned anew.
 
     {"measured": 7, "role": "fit", "configuration": […], "points": [[x, y, z]]}      a standstill, accepted
     {"withdrawn": 7}                                  the standstill is undone
     {"joined": true}                                  the validation so far is part of the fit from here on
+    {"failed": […], "role": "fit", "reason": "…"}     an attempt at a configuration that gave no measurement
     {"excluded": […], "radius": 0.05, "reason": "…", …}
-    {"fit_plan": "3f2a…-fit-…", "plan": "{…}"}        the identifier has taken this plan of the fit
+    {"dropped": 7}                                    where this was measured, no more can be measured
+    {"round": {"number": 0, "measured": 0, …}}        what was known after a batch
     {"finished": "reached"}
 
 Earlier versions wrote these objects as lines of ``campaign_journal.jsonl``, below a line of what it is about. It
-is converted when its folder is opened, in one transaction, and then renamed; a torn last line is ignored.
+is converted when its folder is opened, in one transaction, and then renamed; a torn last line is ignored. Kinds of
+events that are not listed here are those of other versions; they are ignored.
 
 Numbers are JSON, which Python writes and reads exactly to the bit; null is NaN (a target not seen).
 """
@@ -42,7 +47,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -57,6 +62,8 @@ from calib_planner.campaign import (
     CampaignProblem,
     CampaignState,
     Exclusion,
+    PlannedConfiguration,
+    Round,
     from_measurements,
 )
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, StoreError
@@ -88,6 +95,8 @@ WIRE = ("configurations", "test_poses")
 """What is finite in a plan that came in a message, which has no weights."""
 LONGEST = 500
 """Characters kept of a text that came over a wire."""
+ROLES = (FIT, VALIDATION)
+"""What a plan and a measurement can be for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +112,7 @@ class Record:
         unused: Targets, from 0, that the identification rejected.
         number: Its number in the store, ascending; 0: not stored.
         frame: Frame of its points.
+        role: What it is for, ``fit`` or ``validation``; ``index`` is a row of the newest plan for that.
     """
 
     acquired: Standstill | Rejection
@@ -113,6 +123,7 @@ class Record:
     unused: tuple[int, ...] = ()
     number: int = 0
     frame: str = ""
+    role: str = FIT
 
     @property
     def standstill(self) -> Standstill:
@@ -158,7 +169,10 @@ def record_of(path: str | Path, row: Mapping[str, Any], joints: int, targets: in
             acquired = Standstill(start, end, q, array("points", targets, 3), array("std", targets), samples)
         decided = (row["status"], row["reason"], row["configuration"], row["repetition"])
         unused = tuple(json.loads(row["unused"]))
-        return Record(acquired, *decided, unused, row["standstill"], row["frame"])
+        role = row["role"] or FIT  # stores of earlier versions named none
+        if role not in ROLES:
+            raise FileFormatError(path, f"{where}, role", cut(role, 100), " or ".join(ROLES))
+        return Record(acquired, *decided, unused, row["standstill"], row["frame"], role)
     except (TypeError, ValueError, KeyError, IndexError) as error:
         if isinstance(error, FileFormatError):
             raise
@@ -203,14 +217,18 @@ def _text(values: FloatArray) -> str:
 # ── the store ────────────────────────────────────────────────────────────────────────────────────────
 
 CURRENT = "SELECT c.* FROM campaigns AS c JOIN current ON current.campaign = c.number"
+NAMED = """
+    SELECT p.*, c.campaign_id FROM plans AS p JOIN campaigns AS c ON c.number = p.campaign
+    WHERE p.plan_id = ? AND p.plan IS NOT NULL ORDER BY p.number DESC LIMIT 1
+"""
 LATEST = """
     SELECT s.*, d.* FROM decisions AS d JOIN standstills AS s ON s.number = d.standstill
     WHERE d.number IN (SELECT MAX(number) FROM decisions WHERE campaign = ? GROUP BY standstill)
     ORDER BY d.standstill
 """
 WITHDRAW = """
-    INSERT INTO decisions (campaign, standstill, status, reason, configuration, repetition, unused, at)
-    SELECT campaign, standstill, ?, ?, configuration, repetition, '[]', ? FROM decisions
+    INSERT INTO decisions (campaign, standstill, status, reason, configuration, repetition, unused, at, role)
+    SELECT campaign, standstill, ?, ?, configuration, repetition, '[]', ?, role FROM decisions
     WHERE number IN (SELECT MAX(number) FROM decisions WHERE standstill = ? GROUP BY campaign)
 """
 
@@ -246,19 +264,39 @@ class StoredModel:
 
 
 @dataclass(frozen=True, eq=False)
+class NamedPlan:
+    """A plan with its name, and what it is for: ``fit`` or ``validation``."""
+
+    plan_id: str
+    plan: Plan
+    role: str = FIT
+
+
+@dataclass(frozen=True, eq=False)
 class StoredSession:
-    """A plan and what was measured and decided under it.
+    """Plans, and what was measured and decided under them.
 
     Attributes:
-        number: Number of the session.
-        plan_id, plan: The plan, if any.
+        number: Number of the session; 0: it is not stored yet.
+        plans: The newest plan of each role, the one that is measured now last; empty without a plan.
         records: Every standstill with the last decision about it, in the order of measuring.
+        campaign_id: The campaign that the plans are part of; empty: none.
     """
 
     number: int
-    plan_id: str
-    plan: Plan | None
-    records: tuple[Record, ...]
+    plans: tuple[NamedPlan, ...] = ()
+    records: tuple[Record, ...] = ()
+    campaign_id: str = ""
+
+    @property
+    def plan_id(self) -> str:
+        """Name of the plan that is measured now; empty without a plan."""
+        return self.plans[-1].plan_id if self.plans else ""
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan that is measured now."""
+        return self.plans[-1].plan if self.plans else None
 
 
 class Store:
@@ -351,53 +389,93 @@ class SessionStore(Store):
         row = self._one(CURRENT)
         return None if row is None else self._session(row)
 
-    def find(self, plan_id: str, plan: Plan | None) -> StoredSession | None:
-        """The newest session of a plan; ``None`` if there is none.
+    def find(
+        self, plan_id: str, plan: Plan | None, campaign_id: str = "", role: str = FIT
+    ) -> StoredSession | None:
+        """The newest session that a plan belongs to: its campaign's, or its own; ``None`` if there is none.
 
         Raises:
-            InputError: There is another plan of this name, or the name is too long.
+            InputError: There is another plan of this name, or a name is too long.
             StoreError: The file cannot be read now.
         """
-        if len(plan_id) > LONGEST:
-            raise InputError("plan_id", f"{len(plan_id)} characters", f"at most {LONGEST} characters")
-        row = self._one("SELECT * FROM campaigns WHERE plan_id = ? ORDER BY number DESC LIMIT 1", plan_id)
-        if row is None:
-            return None
-        known = self._session(row)
-        if not same_plan(known.plan, plan):
-            advice = "give the new plan a name of its own, or choose another folder"
-            raise InputError("plan_id", repr(plan_id), "a name that no other plan in the store has", advice)
-        return known
+        for field, name in (("plan_id", plan_id), ("campaign_id", campaign_id)):
+            if len(name) > LONGEST:
+                raise InputError(field, f"{len(name)} characters", f"at most {LONGEST} characters")
+        named = self._one(NAMED, plan_id)
+        if named is not None:
+            other = plan_of(self.path or "memory", named["plan"])
+            same = (named["campaign_id"], named["purpose"]) == (campaign_id, role) and same_plan(other, plan)
+            if not same:
+                advice = "give the new plan a name of its own, or choose another folder"
+                raise InputError("plan_id", repr(plan_id), "a name that no other plan in the store has", advice)
+        of = "campaign_id = ?" if campaign_id else "campaign_id = '' AND plan_id = ?"
+        name = campaign_id or plan_id
+        row = self._one(f"SELECT * FROM campaigns WHERE {of} ORDER BY number DESC LIMIT 1", name)
+        return None if row is None else self._session(row)
 
     @property
     def empty(self) -> bool:
         """Whether nothing was ever recorded."""
         return self._one("SELECT 1 FROM standstills LIMIT 1") is None
 
-    def begin(self, plan_id: str, plan: Plan | None, carried: Sequence[Record] = ()) -> StoredSession:
-        """Make a plan's session the current one: the one there is, or a new one.
+    def begin(
+        self,
+        plan_id: str,
+        plan: Plan | None,
+        decided: Sequence[Record] = (),
+        campaign_id: str = "",
+        role: str = FIT,
+    ) -> StoredSession:
+        """Make a plan the one that is measured now, in the session it belongs to, which is made if need be.
 
         Args:
-            carried: What a new session takes over from another, as decided under the new plan.
+            plan_id, plan: The plan.
+            decided: What is decided about standstills under the new plan: what a new session takes over from
+                another one, or what belongs to another row or role than before.
+            campaign_id: The campaign that the plan is part of; empty: none.
+            role: What the plan is for.
 
         Raises:
             InputError: There is another plan of this name.
             StoreError: It cannot be written.
         """
-        known = self.find(plan_id, plan)
-        if known is None:
-            return self._new(plan_id, plan, carried)
-        with self._writing() as write:
-            self._point_at(write, known.number)
-        return known
+        known = self.find(plan_id, plan, campaign_id, role)
+        return self._enter(known, plan_id, plan, decided, campaign_id, role)
 
-    def restart(self, plan_id: str, plan: Plan | None) -> StoredSession:
+    def restart(
+        self, plan_id: str, plan: Plan | None, campaign_id: str = "", role: str = FIT
+    ) -> StoredSession:
         """A session of the same plan with nothing measured; the former stays in the file.
 
         Raises:
             StoreError: It cannot be written.
         """
-        return self._new(plan_id, plan, ())
+        return self._enter(None, plan_id, plan, (), campaign_id, role)
+
+    def _enter(
+        self,
+        known: StoredSession | None,
+        plan_id: str,
+        plan: Plan | None,
+        decided: Sequence[Record],
+        campaign_id: str,
+        role: str,
+    ) -> StoredSession:
+        with self._writing() as write:
+            number = 0 if known is None else known.number
+            if known is None:
+                columns = {"plan_id": plan_id, "campaign_id": campaign_id, "at": _now()}
+                number = _insert(write, "campaigns", columns)
+            if plan is not None and (known is None or known.plan_id != plan_id):
+                told = "SELECT 1 FROM plans WHERE campaign = ? AND plan_id = ?"
+                text = None if write.execute(told, (number, plan_id)).fetchone() else plan_text(plan)
+                columns = {"campaign": number, "plan_id": plan_id, "purpose": role, "plan": text}
+                _insert(write, "plans", columns | {"at": _now()})
+            self._point_at(write, number)
+            for record in decided:
+                _decide(write, number, record.number, record)
+            row = write.execute("SELECT * FROM campaigns WHERE number = ?", (number,)).fetchone()
+        return self._session(row)
 
     def record(self, session: int, record: Record) -> int:
         """Write a standstill and what was decided about it; returns its number.
@@ -430,29 +508,36 @@ class SessionStore(Store):
         with self._writing() as write:
             write.execute(WITHDRAW, (record.status, record.reason[:LONGEST], _now(), record.number))
 
-    def _new(self, plan_id: str, plan: Plan | None, carried: Sequence[Record]) -> StoredSession:
-        with self._writing() as write:
-            columns = {"plan_id": plan_id, "plan": plan_text(plan), "at": _now()}
-            number = _insert(write, "campaigns", columns)
-            self._point_at(write, number)
-            for record in carried:
-                _decide(write, number, record.number, record)
-        return StoredSession(number, plan_id, plan, tuple(carried))
-
     @staticmethod
     def _point_at(write: sqlite3.Connection, number: int) -> None:
         """Make a session the current one; others without a standstill go: plans may come by the thousand."""
         write.execute("INSERT OR REPLACE INTO current VALUES (1, ?)", (number,))
-        write.execute(
-            "DELETE FROM campaigns WHERE number != ? AND number NOT IN (SELECT campaign FROM decisions)",
-            (number,),
-        )
+        unused = "{} != ? AND {} NOT IN (SELECT campaign FROM decisions)"
+        write.execute(f"DELETE FROM plans WHERE {unused.format('campaign', 'campaign')}", (number,))
+        write.execute(f"DELETE FROM campaigns WHERE {unused.format('number', 'number')}", (number,))
 
     def _session(self, row: Mapping[str, Any]) -> StoredSession:
         where, joints, targets = self.path or "memory", len(self.model.joint_names), self.model.targets
         rows = self._rows(LATEST, row["number"])
         records = tuple(record_of(where, r, joints, targets) for r in rows)
-        return StoredSession(row["number"], row["plan_id"], plan_of(where, row["plan"]), records)
+        return StoredSession(row["number"], self._plans(row["number"]), records, row["campaign_id"])
+
+    def _plans(self, session: int) -> tuple[NamedPlan, ...]:
+        """The newest plan of each role, the newest of all last."""
+        texts: dict[str, str] = {}
+        newest: dict[str, str] = {}
+        for row in self._rows("SELECT * FROM plans WHERE campaign = ? ORDER BY number", session):
+            if row["plan"] is not None:  # it is there once, however often the plan came back
+                texts[row["plan_id"]] = row["plan"]
+            newest.pop(row["purpose"], None)
+            newest[row["purpose"]] = row["plan_id"]
+        where, plans = self.path or "memory", []
+        for role, plan_id in newest.items():
+            plan = plan_of(where, texts.get(plan_id))
+            if plan is None or role not in ROLES:
+                raise FileFormatError(where, "plans", cut(plan_id, 100), "a plan for fit or validation")
+            plans.append(NamedPlan(plan_id, plan, role))
+        return tuple(plans)
 
 
 class UnavailableStore(SessionStore):
@@ -495,7 +580,7 @@ def open_store(
         stored = store._stored_model()
         if stored is None or (stored != model and store.empty):
             with store._writing() as write:
-                for table in ("current", "campaigns", "model"):
+                for table in ("current", "plans", "campaigns", "model"):
                     write.execute(f"DELETE FROM {table}")
                 store._write_model(write)
         else:
@@ -531,9 +616,7 @@ def _check_robot(path: Path | None, written: Mapping[str, object], model: Stored
             raise FileFormatError(path, name, cut(got, 100), str(model.marks[name]), advice)
 
 
-def _decide(
-    write: sqlite3.Connection, session: int, standstill: int, record: Record, role: str | None = None
-) -> None:
+def _decide(write: sqlite3.Connection, session: int, standstill: int, record: Record) -> None:
     columns = {
         "campaign": session,
         "standstill": standstill,
@@ -542,7 +625,7 @@ def _decide(
         "configuration": record.index,
         "repetition": record.repetition,
         "unused": json.dumps(record.unused),
-        "role": role,
+        "role": record.role,
     }
     _insert(write, "decisions", columns | {"at": _now()})
 
@@ -593,6 +676,15 @@ MIGRATIONS = (
         number INTEGER PRIMARY KEY AUTOINCREMENT, campaign INTEGER NOT NULL REFERENCES campaigns,
         document TEXT NOT NULL, at TEXT NOT NULL);
     CREATE INDEX standstills_told ON standstills (told);
+    """,
+    """
+    ALTER TABLE campaigns ADD COLUMN campaign_id TEXT NOT NULL DEFAULT '';
+    CREATE TABLE plans (
+        number INTEGER PRIMARY KEY AUTOINCREMENT, campaign INTEGER NOT NULL REFERENCES campaigns,
+        plan_id TEXT NOT NULL, purpose TEXT NOT NULL, plan TEXT, at TEXT NOT NULL);
+    CREATE INDEX plans_named ON plans (plan_id);
+    INSERT INTO plans (campaign, plan_id, purpose, plan, at)
+        SELECT number, plan_id, 'fit', plan, at FROM campaigns WHERE plan IS NOT NULL ORDER BY number;
     """,
 )
 """Entry k makes schema k + 1 out of schema k; an empty file is schema 0."""
@@ -713,8 +805,10 @@ class StoredCampaign:
             (targets, 3) [m] and (targets,) [m], ``None`` where a target was not seen or nobody said how well.
         exclusions: Configurations given up.
         finished: The outcome; empty while it is not ended.
-        fit_plan: Name and plan of the fit that the identifier took last; ``None`` if there is none that holds the
-            validation which joined the fit.
+        failures: ``(role, configuration, reason)`` of each attempt that gave no measurement.
+        dropped: Numbers of measurements at whose configurations no more can be measured.
+        rounds: What was known after each batch.
+        goals: What the campaign has to reach, and how: names of parameters and their values.
     """
 
     store: CampaignStore
@@ -722,7 +816,10 @@ class StoredCampaign:
     rows: tuple[StoredRow, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     finished: str = ""
-    fit_plan: tuple[str, Plan] | None = None
+    failures: tuple[tuple[str, FloatArray, str], ...] = ()
+    dropped: tuple[int, ...] = ()
+    rounds: tuple[Round, ...] = ()
+    goals: Mapping[str, Any] = field(default_factory=dict)
 
     def state(self, problem: CampaignProblem) -> CampaignState:
         """The campaign as far as it came.
@@ -735,7 +832,17 @@ class StoredCampaign:
         data = [_measurements(problem.robot.joint_names, part) for part in parts]
         state = from_measurements(problem, data[0], data[1], self.exclusions)
         pairs = zip(state.measurements, ordered, strict=True)
-        return replace(state, measurements=tuple(replace(m, number=row[0]) for m, row in pairs))
+        measurements = tuple(replace(m, number=row[0]) for m, row in pairs)
+        tried = tuple(PlannedConfiguration(q, role) for role, q, _ in self.failures)
+        first = len(state.configurations)
+        return replace(
+            state,
+            configurations=(*state.configurations, *tried),
+            measurements=measurements,
+            failures=tuple((first + k, reason) for k, (_, _, reason) in enumerate(self.failures)),
+            dropped=tuple(dict.fromkeys(m.index for m in measurements if m.number in self.dropped)),
+            rounds=self.rounds,
+        )
 
 
 class CampaignStore(Store):
@@ -760,23 +867,21 @@ class CampaignStore(Store):
                 std = None if row.std is None else row.std.max(axis=1)  # coordinates of one standstill are alike
                 event |= {"configuration": row.q.tolist(), "points": plain(row.points), "std": plain(std)}
                 events.append(event)
+        for index, reason in after.failures[len(before.failures) :]:
+            planned = after.configurations[index]
+            event = {"failed": planned.q.tolist(), "role": planned.role, "reason": reason[:LONGEST]}
+            events.append(event)
         for e in after.exclusions[len(before.exclusions) :]:
             event = {"excluded": e.q.tolist(), "radius": e.radius, "reason": e.reason[:LONGEST]}
             events.append(event | {"asked": e.requested})
+        for index in after.dropped[len(before.dropped) :]:
+            events += [{"dropped": r.number} for r in after.measurements if r.index == index][:1]
+        events += [{"round": plain(asdict(r))} for r in after.rounds[len(before.rounds) :]]
         if after.result is not None and before.result is None:
             events.append({"finished": after.outcome})
         if events:
             with self._writing() as write:
                 self._write(write, events)
-
-    def note_plan(self, plan_id: str, plan: Plan) -> None:
-        """Write which plan of the fit the identifier has taken.
-
-        Raises:
-            StoreError: It cannot be written; nothing was.
-        """
-        with self._writing() as write:
-            self._write(write, [{"fit_plan": plan_id, "plan": plan_text(plan)}])
 
     def _begin(self, write: sqlite3.Connection, campaign_id: str) -> None:
         if self._stored_model() is None:
@@ -793,15 +898,13 @@ class CampaignStore(Store):
                 former = write.execute(TOLD, (campaign, told)).fetchone()[0]
                 write.execute(WITHDRAW, (UNDONE, "", _now(), former))
             if "measured" in event:
-                role = str(event["role"])
-                if role not in (FIT, VALIDATION):
-                    raise InputError("role", cut(role, 100), f"{FIT} or {VALIDATION}")
+                role = _role(event["role"])
                 q, points = np.array(event["configuration"], float), np.array(event["points"], float)
                 unknown, said = np.full(self.model.targets, np.nan), event.get("std")
                 std = unknown if said is None else np.array(said, float)
                 stood = Standstill(0, 0, q, points, std, np.zeros(self.model.targets, np.int64))
                 number = _insert(write, "standstills", standstill_row(stood, "") | {"told": told})
-                _decide(write, campaign, number, Record(stood, ACCEPTED, "", None, 0), role)
+                _decide(write, campaign, number, Record(stood, ACCEPTED, "", None, 0, role=role))
             elif "withdrawn" not in event:
                 if "joined" in event:
                     write.execute(JOIN, (campaign, _now()))
@@ -823,24 +926,61 @@ class CampaignStore(Store):
                     points, std = plain(stood.points), plain(stood.std)
                     rows.append((row["told"], row["role"], stood.joints.tolist(), points, std))
             _measurements(self.model.joint_names, rows)  # refuses what is no measurement
-            exclusions, finished, fit_plan = [], "", None
+            exclusions, failures, dropped, rounds, finished = [], [], [], [], ""
             for event in (json.loads(row["document"]) for row in self._rows(sql, current["number"])):
                 if "excluded" in event:
                     q = np.array(event["excluded"], float).reshape(joints)
                     others = float(event["radius"]), str(event["reason"]), bool(event["asked"])
                     exclusions.append(Exclusion(-1, q, *others))
-                elif "fit_plan" in event or "joined" in event:
-                    plan = None if "joined" in event else plan_of(path, event["plan"])
-                    fit_plan = None if plan is None else (str(event["fit_plan"]), plan)
+                elif "failed" in event:
+                    q = frozen(np.array(event["failed"], float).reshape(joints))
+                    failures.append((_role(event["role"]), q, str(event["reason"])))
+                elif "joined" in event:
+                    failures = [(FIT, q, reason) for _, q, reason in failures]
+                elif "dropped" in event:
+                    dropped.append(int(event["dropped"]))
+                elif "round" in event:
+                    rounds.append(_round(event["round"]))
                 elif "finished" in event:
                     finished = str(event["finished"])
-        return StoredCampaign(self, current["plan_id"], tuple(rows), tuple(exclusions), finished, fit_plan)
+            last = self._one("SELECT document FROM settings ORDER BY number DESC LIMIT 1")
+            goals = dict(json.loads(last["document"])) if last is not None else {}
+        lists = tuple(failures), tuple(dropped), tuple(rounds)
+        return StoredCampaign(
+            self, current["plan_id"], tuple(rows), tuple(exclusions), finished, *lists, goals
+        )
+
+
+def _role(name: object) -> str:
+    if name not in ROLES:
+        raise InputError("role", cut(name, 100), " or ".join(ROLES))
+    return str(name)
+
+
+def _round(values: Mapping[str, Any]) -> Round:
+    """A round out of JSON, in which numbers that are not finite are null: nothing was identified then."""
+    unknown = {"accuracy": float("inf"), "left": float("inf"), "floor": float("nan")}
+    unknown |= {"sigma": float("nan"), "left_out": float("nan")}
+    return Round(**{name: unknown[name] if value is None else value for name, value in values.items()})
 
 
 def begin_campaign(
-    folder: str | Path, campaign_id: str, problem: CampaignProblem, version: str, field: str = "store_folder"
+    folder: str | Path,
+    campaign_id: str,
+    robot: Robot,
+    goals: Mapping[str, object],
+    version: str,
+    field: str = "store_folder",
 ) -> CampaignStore:
     """A new record in ``folder``, which is made if need be; one that is there is kept beside under another name.
+
+    Args:
+        folder: The folder.
+        campaign_id: Name of the campaign.
+        robot: The robot that is measured.
+        goals: What the campaign has to reach, and how: names of parameters and their values, which JSON can hold.
+        version: Of this package, for the record.
+        field: The parameter that named the folder, for errors.
 
     Raises:
         FileFormatError: A symbolic link stands in its place.
@@ -858,9 +998,7 @@ def begin_campaign(
         for name in (CAMPAIGN_FILE, f"{CAMPAIGN_FILE}-wal", JOURNAL):
             if path.with_name(name).exists():
                 path.with_name(name).rename(path.with_name(f"before_{campaign_id}_{name}"))
-    store = CampaignStore(path, connect(path, field), _model(problem.robot))
-    goals = {f.name: plain(getattr(problem, f.name)) for f in fields(problem)}
-    goals = {name: value for name, value in goals.items() if isinstance(value, (int, float, list))}
+    store = CampaignStore(path, connect(path, field), _model(robot))
     try:
         with store._writing() as write:
             store._begin(write, campaign_id)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import plan_of
 
 from calib_planner import FileFormatError, Robot
 from calib_planner.campaign import (
@@ -23,22 +22,24 @@ from calib_planner.campaign import (
     CampaignState,
     NextStep,
     PlannedConfiguration,
+    Round,
     begin,
 )
 from calib_planner.errors import InputError, StoreError
 from calib_planner.io import CampaignStore, begin_campaign, open_campaign
 from calib_planner.io.store import CAMPAIGN_FILE as FILE
-from calib_planner.io.store import JOURNAL, StoredCampaign, same_plan
+from calib_planner.io.store import JOURNAL, StoredCampaign
 
 ROBOT = Robot.load("planar_2r")
 PROBLEM = CampaignProblem(ROBOT, [0.2, 0.9], 1e-5)
+GOALS = {"required_accuracy": 1e-5, "test_poses": "0.2 0.9", "budget": 60, "constraints": ""}
 Q = np.random.default_rng(0).uniform(-1.5, 1.5, (6, 2))
 POINTS = np.random.default_rng(1).normal(size=(6, 1, 3)) / 3.0
 
 
 def noted(folder: Path) -> tuple[CampaignStore, CampaignState]:
     """Four visits for the fit, two for validation; one undone, one given up."""
-    store = begin_campaign(folder, "abc", PROBLEM, "1.2.3")
+    store = begin_campaign(folder, "abc", ROBOT, GOALS, "1.2.3")
     stops = tuple(PlannedConfiguration(q, FIT if k < 4 else VALIDATION) for k, q in enumerate(Q))
     state = begin(PROBLEM).decided(NextStep(FIT, "", stops, queue=(0, 1, 2, 3, 4, 5)))
     events = [
@@ -68,6 +69,7 @@ def reopened(folder: Path) -> Iterator[StoredCampaign]:
 def old_journal(folder: Path, more: str = "") -> Path:
     """A folder of an earlier version that ends with ``more``; it holds what ``noted`` writes."""
     written = (Path(__file__).parent / "written_before" / JOURNAL).read_text()
+    folder.mkdir(exist_ok=True)
     (folder / JOURNAL).write_text(written + more)
     return folder / JOURNAL
 
@@ -94,10 +96,13 @@ def test_it_comes_back_to_the_bit(tmp_path: Path, converted: bool) -> None:
 def test_the_requirements_are_kept(tmp_path: Path) -> None:
     noted(tmp_path)[0].close()
     database = sqlite3.connect(tmp_path / FILE)
-    version, document = database.execute("SELECT version, document FROM settings").fetchone()
-    goals = json.loads(document)
-    assert version == "1.2.3" and goals["required_accuracy"] == 1e-5 and goals["test_poses"] == [[0.2, 0.9]]
-    assert (goals["budget"], goals["seed"]) == (PROBLEM.budget, PROBLEM.seed)
+    assert database.execute("SELECT version FROM settings").fetchall() == [("1.2.3",)]
+    database.close()
+    with reopened(tmp_path) as stored:
+        assert stored.goals == GOALS
+    old_journal(tmp_path / "old")
+    with reopened(tmp_path / "old") as stored:
+        assert stored.goals == {}
 
 
 def test_a_measurement_told_again_replaces_the_former(tmp_path: Path) -> None:
@@ -113,7 +118,7 @@ def test_standard_deviations_come_back_to_the_bit(tmp_path: Path) -> None:
     """Those of the samples of a standstill; of a campaign in which one measurement has none, none."""
     robot = ROBOT.with_targets(np.zeros((2, 3)))
     problem = CampaignProblem(robot, [0.2, 0.9], 1e-5)
-    store = begin_campaign(tmp_path, "abc", problem, "1.2.3")
+    store = begin_campaign(tmp_path, "abc", robot, GOALS, "1.2.3")
     stops = tuple(PlannedConfiguration(q, FIT) for q in Q)
     state = begin(problem).decided(NextStep(FIT, "", stops, queue=tuple(range(6))))
     rng = np.random.default_rng(2)
@@ -146,17 +151,33 @@ def test_a_validation_that_joined_the_fit_is_part_of_it(tmp_path: Path) -> None:
     assert len(again.measurements_of(FIT)) == 3 and again.data(VALIDATION) is None
 
 
-def test_the_last_plan_of_the_fit_counts_until_a_validation_joins(tmp_path: Path) -> None:
+def test_what_failed_was_dropped_and_was_known_comes_back(tmp_path: Path) -> None:
+    """A restart neither gets its failed attempts back into the budget nor forgets what was given up."""
     store, state = noted(tmp_path)
-    for name, count in (("abc-fit-1", 3), ("abc-fit-2", 4)):
-        store.note_plan(name, plan_of(ROBOT, Q[:count] / 3.0))
+    nan, number = float("nan"), len(state.rounds)
+    first = Round(number, 0, 0, float("inf"), nan, nan, nan, 4, "first")
+    last = Round(number + 1, 2, 2, 3e-5, 1e-5, 2e-5, 7.0, 2, "second", 4e-5)
+    events = [
+        lambda s: s.decided(NextStep(VALIDATION, "", round=first)),
+        lambda s: s.failed(5, "a beam break"),
+        lambda s: s.failed(1, "moved"),
+        lambda s: s.unreachable(3, "a cable"),
+        lambda s: s.decided(NextStep(VALIDATION, "", round=last)),
+    ]
+    for event in events:
+        after = event(state)
+        store.note(state, after)
+        state = after
     store.close()
     with reopened(tmp_path) as stored:
-        assert stored.fit_plan is not None and stored.fit_plan[0] == "abc-fit-2"
-        assert same_plan(stored.fit_plan[1], plan_of(ROBOT, Q[:4] / 3.0)) and len(stored.rows) == 3
-        stored.store.note(state, state.decided(NextStep(FIT, "", joins=True)))
-    with reopened(tmp_path) as stored:
-        assert stored.fit_plan is None
+        again = stored.state(PROBLEM)
+    assert state.spent(FIT) == 4 and state.spent(VALIDATION) == 2 and state.given_up == 3
+    for role in (FIT, VALIDATION, None):
+        assert again.spent(role) == state.spent(role), role
+    assert again.given_up == state.given_up and len(again.dropped) == 1
+    assert again.configurations[again.dropped[0]].q.tolist() == Q[3].tolist()
+    assert [reason for _, reason in again.failures] == ["undone", "a beam break", "moved"]
+    assert again.rounds[1] == last and repr(again.rounds[0]) == repr(replace(first, left=float("inf")))
 
 
 def test_a_write_torn_at_any_byte_leaves_whole_events(tmp_path: Path) -> None:
@@ -218,10 +239,10 @@ def test_a_journal_that_was_converted_before_a_crash_is_not_converted_twice(tmp_
 
 
 def test_what_ended_and_joined_in_a_journal_is_read(tmp_path: Path) -> None:
-    text = json.dumps({"fit_plan": "abc-fit-1", "plan": None})
+    text = json.dumps({"fit_plan": "abc-fit-1", "plan": None})  # of an earlier version; nobody needs it
     old_journal(tmp_path, f'{{"joined": true}}\n{text}\n{{"finished": "reached"}}\n')
     with reopened(tmp_path) as stored:
-        assert stored.finished == "reached" and stored.fit_plan is None
+        assert stored.finished == "reached"
         assert [role for _, role, *_ in stored.rows] == [FIT] * 3
 
 
@@ -230,7 +251,8 @@ def test_what_ended_and_joined_in_a_journal_is_read(tmp_path: Path) -> None:
     ["[]", "nonsense", '{"measured": 1, "role": "fit", "configuration": [1], "points": [[0,0,0]]}',
      '{"measured": "x"}', '{"excluded": [1, 2, 3], "radius": 1, "reason": "", "asked": false}',
      '{"measured": 1, "role": "fit", "configuration": [1e999, 0], "points": [[0,0,0]]}',
-     '{"fit_plan": "x"}', '{"fit_plan": "x", "plan": {"robot": "planar_2r"}}', '{"fit_plan": "x", "plan": "{}"}'],
+     '{"failed": [1, 2], "role": "play", "reason": ""}', '{"failed": [1], "role": "fit", "reason": ""}',
+     '{"dropped": null}', '{"round": {"accuracy": 1.0}}', '{"round": {"colour": 1}}'],
 )  # fmt: skip
 def test_damage_in_the_middle_is_refused_by_name(tmp_path: Path, line: str) -> None:
     journal = old_journal(tmp_path, line + "\n" + json.dumps({"withdrawn": 2}) + "\n")
@@ -245,7 +267,7 @@ def test_damage_in_the_middle_is_refused_by_name(tmp_path: Path, line: str) -> N
 
 def test_a_new_campaign_leaves_the_old_one_beside(tmp_path: Path) -> None:
     noted(tmp_path)[0].close()
-    begin_campaign(tmp_path, "def", PROBLEM, "").close()
+    begin_campaign(tmp_path, "def", ROBOT, GOALS, "").close()
     assert len(list(tmp_path.iterdir())) == 2
     with reopened(tmp_path) as stored:
         assert stored.campaign_id == "def" and not stored.rows
@@ -260,7 +282,7 @@ def test_a_new_campaign_leaves_what_is_damaged_beside(tmp_path: Path, name: str)
     (tmp_path / name).write_bytes(b"not a database at all " * 100)
     with pytest.raises(FileFormatError):
         open_campaign(tmp_path, ROBOT)
-    begin_campaign(tmp_path, "def", PROBLEM, "").close()
+    begin_campaign(tmp_path, "def", ROBOT, GOALS, "").close()
     with reopened(tmp_path) as stored:
         assert stored.campaign_id == "def"
     assert (tmp_path / f"before_def_{name}").read_bytes() == b"not a database at all " * 100
@@ -282,7 +304,7 @@ def test_another_robots_record_is_refused(tmp_path: Path, converted: bool) -> No
 
 def test_a_record_in_use_is_left_alone(tmp_path: Path) -> None:
     store, state = noted(tmp_path)
-    for attempt in (lambda: begin_campaign(tmp_path, "def", PROBLEM, ""), lambda: open_campaign(tmp_path, ROBOT)):
+    for attempt in (lambda: begin_campaign(tmp_path, "def", ROBOT, GOALS, ""), lambda: open_campaign(tmp_path, ROBOT)):
         with pytest.raises(InputError, match="another process uses"):
             attempt()
     store.note(state, state.measured(5, Q[5], POINTS[5], 16))
@@ -295,7 +317,7 @@ def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
     with pytest.raises(StoreError, match="file"):
-        begin_campaign(file, "abc", PROBLEM, "")
+        begin_campaign(file, "abc", ROBOT, GOALS, "")
     store, state = noted(tmp_path / "gone")
     shutil.rmtree(tmp_path / "gone")
     with pytest.raises(StoreError):
@@ -303,7 +325,7 @@ def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "link").mkdir()
     (tmp_path / "link" / FILE).symlink_to(tmp_path / "file")
     with pytest.raises(FileFormatError, match="symbolic link"):
-        begin_campaign(tmp_path / "link", "abc", PROBLEM, "")
+        begin_campaign(tmp_path / "link", "abc", ROBOT, GOALS, "")
 
 
 def test_a_full_database_changes_nothing_and_recovers(tmp_path: Path) -> None:

@@ -87,9 +87,9 @@ def test_texts_from_the_wire_are_bounded(store: SessionStore) -> None:
         store.begin("p" * 10**6, None)
 
 
-def test_sql_in_texts_is_text(store: SessionStore) -> None:
+def test_sql_in_texts_is_text(store: SessionStore, planned: Plan) -> None:
     evil = "'); DROP TABLE decisions; --\0"
-    campaign = begun(store, evil)
+    campaign = begun(store, evil, planned)
     store.record(campaign, decision(standstill(1), frame=evil, reason=evil))
     found = store.current()
     assert found is not None and found.plan_id == evil and found.records[0].reason == evil
@@ -259,7 +259,7 @@ def test_what_is_no_database_is_refused(tmp_path: Path, text: bytes) -> None:
 def test_damage_is_found_on_opening(tmp_path: Path) -> None:
     store = opened(tmp_path)
     campaign = begun(store)
-    for k in range(60):
+    for k in range(150):  # most of the file is rows then, not room for more
         store.record(campaign, decision(standstill(k)))
     store.close()
     whole = content(tmp_path)

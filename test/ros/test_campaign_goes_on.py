@@ -6,79 +6,25 @@ import multiprocessing
 import os
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from operator import attrgetter
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 import pytest
-from robots import plan_of, random_configurations
+from sessions import HOW, PLAN, ROBOT, assert_same_estimate, begun, measure, opened, planned, seen
 
-from calib_planner import Estimate, Plan, Robot
-from calib_planner.acquisition import NANO, Rejection, RejectionReason, Standstill
+from calib_planner import Estimate
+from calib_planner.acquisition import Rejection, RejectionReason, Standstill
 from calib_planner.error_model import ErrorModel
 from calib_planner.errors import InputError, StoreError
-from calib_planner.io import NOT_STORED, SessionStore, StoredModel, UnavailableStore, open_store
+from calib_planner.io import NOT_STORED, StoredModel, UnavailableStore
 from calib_planner.ros import session
-from calib_planner.ros.session import MOST_REJECTIONS, Matching, Session, TooFew, condition_of
-from calib_planner.simulation import random_deviations
-
-HOW = Matching(sigma=3e-5)
-ROBOT = Robot.load("planar_2r").with_parameters("lengths+offsets")
-TRUE = ROBOT.with_deviations(random_deviations(ROBOT, 3))
-LEVELS: dict[str, Callable[[Plan], Robot]] = {"same": lambda _: ROBOT}
-
-
-def planned(count: int = 12, seed: int = 0) -> Plan:
-    return plan_of(ROBOT, random_configurations(ROBOT, count, seed))
-
-
-PLAN = planned()
-
-
-def opened(folder: Path | str) -> SessionStore:
-    return open_store(str(folder), StoredModel(ROBOT.name, ROBOT.joint_names, 1, "text"), {}, "")
-
-
-def begun(store: SessionStore, plan: Plan | None = PLAN) -> Session:
-    made = Session(ROBOT, LEVELS["same"], store)
-    if plan is not None:
-        made.begin("p", plan, HOW.tolerance)
-    return made
-
-
-def seen(row: int, error: float = 0.0, attempt: int = 0, plan: Plan = PLAN) -> Standstill:
-    """What the tracker sees at a row of the plan, the same whenever it is asked; ``error`` [m] on top."""
-    q = plan.configurations[row]
-    rng = np.random.default_rng([row, attempt])
-    point = TRUE.positions(q)[0] + 3e-5 / np.sqrt(20) * rng.standard_normal((1, 3)) + [error, 0.0, 0.0]
-    start = (1000 + 2 * row) * NANO
-    return Standstill(start, start + NANO, q, point, np.full(1, 3e-5 / np.sqrt(20)), np.array([20]))
-
-
-def measure(campaign: Session, *founds: Standstill) -> list[str]:
-    """Statuses in the order told: of the standstills, and of what is seen otherwise after each."""
-    told = []
-    for found in founds:
-        decision = campaign.take(found, HOW, "laser")
-        told.append(decision.status)
-        if decision.status == "accepted":
-            campaign.estimate(HOW)
-            told += [f"{d.index} {d.status}" for d in campaign.judge()]
-    return told
-
-
-def assert_same_estimate(a: object, b: object) -> None:
-    assert isinstance(a, Estimate) and isinstance(b, Estimate)
-    for name in ("fit.values", "fit.deviations", "fit.covariance", "residuals.vectors"):
-        assert np.allclose(attrgetter(name)(a), attrgetter(name)(b), rtol=0, atol=1e-12, equal_nan=True), name
-    assert a.points.rejected == b.points.rejected and a.verdict == b.verdict
-
+from calib_planner.ros.session import MOST_REJECTIONS, Session, TooFew, condition_of
 
 # ── outliers ─────────────────────────────────────────────────────────────────────────────────────────
 
@@ -91,7 +37,7 @@ def test_an_outlier_is_told_kept_and_measured_again() -> None:
     assert "standard deviations" in outlier.reason and outlier.unused == (0,)
     assert campaign.rejections == {"outlier": 1} and len(campaign.accepted) == 8
     assert 8 in campaign.missing() and campaign.done()[8] == 0
-    assert measure(campaign, seen(8)) == ["accepted"] and campaign.records[-1].repetition == 0
+    assert measure(campaign, seen(8, attempt=1)) == ["accepted"] and campaign.records[-1].repetition == 0
     assert 8 not in campaign.missing()
     trail = [t["status"] for t in campaign.store.history(outlier.number)]
     assert trail == ["accepted", "outlier"]
@@ -250,7 +196,7 @@ def test_rejections_cannot_fill_the_disk(monkeypatch: pytest.MonkeyPatch) -> Non
     assert MOST_REJECTIONS > 20
     campaign = begun(opened(""))
     wrong = Rejection(1, 2, RejectionReason.MOVED, "moved", np.zeros(2), np.array([3]))
-    numbers = [campaign.refuse(wrong).number for _ in range(50)]
+    numbers = [campaign.refuse(replace(wrong, end=2 + k)).number for k in range(50)]
     assert sum(n > 0 for n in numbers) == 20 and campaign.rejections == {"moved": 50}
     assert measure(campaign, seen(0)) == ["accepted"]
 

@@ -12,7 +12,7 @@ from calib_planner import Estimate, Plan, PlanProblem, Robot, plan
 from calib_planner.acquisition import Standstill, StandstillDetector
 from calib_planner.error_model import ErrorModel
 from calib_planner.errors import InputError, NotEnoughDataError, UnknownNameError
-from calib_planner.io import SessionStore, StoredModel, open_store
+from calib_planner.io import NamedPlan, SessionStore, StoredModel, open_store
 from calib_planner.planning import Search
 from calib_planner.ros import session as saving
 from calib_planner.ros.session import Matching, Session, TooFew
@@ -66,7 +66,8 @@ def memory(robot: Robot) -> SessionStore:
 def standstill(robot: Robot, q: np.ndarray, seed: int = 0) -> Standstill:
     cell = SimulatedCell(robot, random_deviations(robot, 3), 1e-5)
     points = cell.measure([q], 1, seed).p[0]
-    return Standstill(0, 10**9, q, points, np.full(1, 1e-5), np.array([20]))
+    start = 2 * seed * 10**9
+    return Standstill(start, start + 10**9, q, points, np.full(1, 1e-5), np.array([20]))
 
 
 def test_from_too_few_to_complete(robot: Robot, planned: Plan, campaign: Session) -> None:
@@ -118,7 +119,7 @@ def test_plans_for_others_are_refused(robot: Robot, planned: Plan, campaign: Ses
 
 def test_memory_is_bounded(robot: Robot, planned: Plan, campaign: Session) -> None:
     how = replace(HOW, most=2)
-    statuses = [campaign.take(standstill(robot, planned.configurations[0]), how).status for _ in range(4)]
+    statuses = [campaign.take(standstill(robot, planned.configurations[0], k), how).status for k in range(4)]
     assert statuses == ["accepted", "accepted", "not_in_plan", "not_in_plan"]
 
 
@@ -144,7 +145,7 @@ def test_save(tmp_path, robot: Robot, planned: Plan, campaign: Session) -> None:
     # One measurement tells something of a robot with tolerances, and too little of one of which nothing is known.
     nothing_known = replace(HOW, error_model=ErrorModel.paper())
     assert [p.name for p in saving.save(str(tmp_path / "new"), campaign, nothing_known)] == ["measurements_p.csv"]
-    campaign.plan_id = "../../evil/\0" + "x" * 1000
+    campaign.plans = (NamedPlan("../../evil/\0" + "x" * 1000, planned),)
     for i in (1, 2, 3):
         campaign.take(standstill(robot, planned.configurations[i], i), HOW)
     paths = saving.save(str(tmp_path), campaign, HOW)
