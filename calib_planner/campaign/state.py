@@ -274,9 +274,7 @@ class CampaignState:
         self._check_index(index)
         return self._exclude(index, reason, requested=False)
 
-    def skipped(
-        self, index: int, reason: str = "skipped on request", *, replan: bool = False
-    ) -> CampaignState:
+    def skipped(self, index: int, reason: str = "skipped on request", *, replan: bool = False) -> CampaignState:
         """A person does not want the robot there.
 
         Args:

@@ -89,6 +89,7 @@ if TYPE_CHECKING:
         begin_campaign,
         open_campaign,
         open_store,
+        stored_goals,
         stored_model,
     )
     from calib_planner.io.text import check_writable, fresh_folder, make_folder, read_text, user_path, write_text
@@ -124,8 +125,8 @@ else:
             "sizes": "angle_factors",
             "sources": "Sources read_source read_sources",
             "store": "ACCEPTED CLOCK_OFFSET DECISIONS KEPT LONGEST NOT_IN_PLAN NOT_STORED OUTLIER UNDONE "
-            "SessionStore CampaignStore NamedPlan Record StoredSession StoredModel UnavailableStore begin_campaign "
-            "open_campaign open_store stored_model",
+            "SessionStore CampaignStore NamedPlan Record StoredSession StoredModel UnavailableStore "
+            "begin_campaign open_campaign open_store stored_goals stored_model",
             "text": "check_writable fresh_folder make_folder read_text user_path write_text",
             "understanding": "BagTopics JointTable Reading Source Understanding",
             "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_chain read_speed_limits require_urdf "

@@ -4,10 +4,10 @@
 memory. Its tables only grow. A *standstill* is raw data and never changes. What was decided about it is a row of
 the log ``decisions``: a later decision replaces an earlier one, and both stay. The *role* of a standstill, fit or
 validation, is part of the decision. A *record* is a standstill with its last decision. A *session* (table
-``campaigns``) is what was measured of one campaign, under however many plans, or of one plan that is part of no
-campaign; table ``plans`` says which plans were taken, the newest last. Only the pointer to the current session
-moves, and a session in which nothing was measured gives way to the next. The model's source text, the settings and
-the version of the package that wrote are kept beside.
+``campaigns``) is what was measured of one campaign, under however many plans, or of one plan that is part of
+none; table ``plans`` says which plans were taken, the newest last. Only the pointer to the current session
+moves, and a session in which nothing was measured gives way to the next. The model's source text, the settings
+and the version of the package that wrote are kept beside.
 
 SQLite writes ahead with ``synchronous=FULL``: a commit that returned survives ``kill -9`` and a power cut, one
 that did not leaves nothing behind. ``locking_mode=EXCLUSIVE`` keeps a second process out and needs no file of
@@ -32,8 +32,8 @@ measured is planned anew.
     {"finished": "reached"}
 
 Earlier versions wrote these objects as lines of ``campaign_journal.jsonl``, below a line of what it is about. It
-is converted when its folder is opened, in one transaction, and then renamed; a torn last line is ignored. Kinds of
-events that are not listed here are those of other versions; they are ignored.
+is converted when its folder is opened, in one transaction, and then renamed; a torn last line is ignored. Kinds
+of events that are not listed here are those of other versions; they are ignored.
 
 Numbers are JSON, which Python writes and reads exactly to the bit; null is NaN (a target not seen).
 """
@@ -47,7 +47,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -442,9 +442,7 @@ class SessionStore(Store):
         known = self.find(plan_id, plan, campaign_id, role)
         return self._enter(known, plan_id, plan, decided, campaign_id, role)
 
-    def restart(
-        self, plan_id: str, plan: Plan | None, campaign_id: str = "", role: str = FIT
-    ) -> StoredSession:
+    def restart(self, plan_id: str, plan: Plan | None, campaign_id: str = "", role: str = FIT) -> StoredSession:
         """A session of the same plan with nothing measured; the former stays in the file.
 
         Raises:
@@ -469,8 +467,8 @@ class SessionStore(Store):
             if plan is not None and (known is None or known.plan_id != plan_id):
                 told = "SELECT 1 FROM plans WHERE campaign = ? AND plan_id = ?"
                 text = None if write.execute(told, (number, plan_id)).fetchone() else plan_text(plan)
-                columns = {"campaign": number, "plan_id": plan_id, "purpose": role, "plan": text}
-                _insert(write, "plans", columns | {"at": _now()})
+                named: dict[str, Any] = {"campaign": number, "plan_id": plan_id, "purpose": role, "plan": text}
+                _insert(write, "plans", named | {"at": _now()})
             self._point_at(write, number)
             for record in decided:
                 _decide(write, number, record.number, record)
@@ -808,7 +806,6 @@ class StoredCampaign:
         failures: ``(role, configuration, reason)`` of each attempt that gave no measurement.
         dropped: Numbers of measurements at whose configurations no more can be measured.
         rounds: What was known after each batch.
-        goals: What the campaign has to reach, and how: names of parameters and their values.
     """
 
     store: CampaignStore
@@ -819,7 +816,6 @@ class StoredCampaign:
     failures: tuple[tuple[str, FloatArray, str], ...] = ()
     dropped: tuple[int, ...] = ()
     rounds: tuple[Round, ...] = ()
-    goals: Mapping[str, Any] = field(default_factory=dict)
 
     def state(self, problem: CampaignProblem) -> CampaignState:
         """The campaign as far as it came.
@@ -933,8 +929,8 @@ class CampaignStore(Store):
                     others = float(event["radius"]), str(event["reason"]), bool(event["asked"])
                     exclusions.append(Exclusion(-1, q, *others))
                 elif "failed" in event:
-                    q = frozen(np.array(event["failed"], float).reshape(joints))
-                    failures.append((_role(event["role"]), q, str(event["reason"])))
+                    tried = frozen(np.array(event["failed"], float).reshape(joints))
+                    failures.append((_role(event["role"]), tried, str(event["reason"])))
                 elif "joined" in event:
                     failures = [(FIT, q, reason) for _, q, reason in failures]
                 elif "dropped" in event:
@@ -943,12 +939,12 @@ class CampaignStore(Store):
                     rounds.append(_round(event["round"]))
                 elif "finished" in event:
                     finished = str(event["finished"])
-            last = self._one("SELECT document FROM settings ORDER BY number DESC LIMIT 1")
-            goals = dict(json.loads(last["document"])) if last is not None else {}
         lists = tuple(failures), tuple(dropped), tuple(rounds)
-        return StoredCampaign(
-            self, current["plan_id"], tuple(rows), tuple(exclusions), finished, *lists, goals
-        )
+        return StoredCampaign(self, current["plan_id"], tuple(rows), tuple(exclusions), finished, *lists)
+
+    def _goals(self) -> dict[str, Any]:
+        last = self._one("SELECT document FROM settings ORDER BY number DESC LIMIT 1")
+        return {} if last is None else dict(json.loads(last["document"]))
 
 
 def _role(name: object) -> str:
@@ -959,7 +955,7 @@ def _role(name: object) -> str:
 
 def _round(values: Mapping[str, Any]) -> Round:
     """A round out of JSON, in which numbers that are not finite are null: nothing was identified then."""
-    unknown = {"accuracy": float("inf"), "left": float("inf"), "floor": float("nan")}
+    unknown: dict[str, Any] = {"accuracy": float("inf"), "left": float("inf"), "floor": float("nan")}
     unknown |= {"sigma": float("nan"), "left_out": float("nan")}
     return Round(**{name: unknown[name] if value is None else value for name, value in values.items()})
 
@@ -1039,6 +1035,25 @@ def open_campaign(folder: str | Path, robot: Robot, field: str = "store_folder")
         if new:
             path.unlink(missing_ok=True)
         raise
+
+
+def stored_goals(folder: str | Path, field: str = "store_folder") -> dict[str, Any] | None:
+    """What the campaign recorded in ``folder`` has to reach, and how: names of parameters and their values.
+
+    Empty where earlier versions wrote none; ``None`` if there is no record.
+
+    Raises:
+        FileFormatError, InputError, StoreError: As ``open_campaign``.
+    """
+    path = user_path(folder) / CAMPAIGN_FILE
+    if not path.exists():
+        return {} if path.with_name(JOURNAL).exists() else None
+    store = CampaignStore(path, connect(path, field), StoredModel("", (), 0, ""))
+    try:
+        with _readable(path):
+            return store._goals()
+    finally:
+        store.close()
 
 
 def _model(robot: Robot) -> StoredModel:

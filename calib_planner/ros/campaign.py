@@ -4,18 +4,23 @@
 was accepted. Every step has an end. A robot that refuses a configuration cannot reach it; a standstill that the
 identifier rejects, or does not mention, is a failed attempt. A robot or identifier that is not there or does not
 answer, and what would spoil any measurement (``ANYWHERE``), is not the configuration's fault: ``Measuring`` waits
-for it to pass, and tries again every ``RETRY`` seconds.
+for it to pass, and tries again every ``RETRY`` seconds. A robot that was stopped by a person, or by a lost beam,
+goes on when a person says so: ``Measuring`` is ``halted``.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from calib_planner_msgs.action import ExecutePlan
-from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, JointConfiguration, Measurement
+from calib_planner_msgs.msg import Plan as PlanMessage
 from rclpy.publisher import Publisher
 
 from calib_planner.acquisition import pick_joints
@@ -47,13 +52,56 @@ from calib_planner.ros.messages import (
 )
 from calib_planner.ros.model import Model, NotReady, with_targets
 from calib_planner.ros.planning import constraints_of
-from calib_planner.ros.session import confined
+from calib_planner.ros.session import condition_of, confined
 from calib_planner.ros.settings import CampaignParameters, unknown_words
 from calib_planner.units import cut, listed
 
 SAME = ("budget", "batch", "validation", "minimum", "attempts", "most_failures", "exclusion", "sigma", "starts",
         "time_limit", "seed", "accuracy_frame")  # fmt: skip
 """Parameters that are fields of ``CampaignProblem``."""
+GOALS = (
+    "required_accuracy",
+    "test_poses",
+    "parameters",
+    "unknown",
+    "targets",
+    "constraints",
+    "error_model",
+    *SAME,
+)
+"""Parameters that say what a campaign has to reach, and how: they stay what they were when it began."""
+
+
+def goals_of(settings: CampaignParameters) -> dict[str, Any]:
+    """What the record of a campaign keeps of the parameters."""
+    return {name: getattr(settings, name) for name in GOALS}
+
+
+def with_goals(settings: CampaignParameters, goals: Mapping[str, Any]) -> tuple[CampaignParameters, list[str]]:
+    """The parameters with the goals of a record, and in words what differs.
+
+    Args:
+        settings: The parameters now.
+        goals: Those of the record; what it does not name is taken from the parameters.
+
+    Raises:
+        InputError: The record holds a value that is none.
+    """
+    stored: dict[str, Any] = {}
+    differing: list[str] = []
+    for name in GOALS:
+        now, value = getattr(settings, name), goals.get(name)
+        if isinstance(value, list):  # poses, as earlier versions wrote them
+            value = "; ".join(" ".join(map(repr, row)) for row in value)
+        if value is None:
+            continue
+        if type(value) is not type(now) and not (type(now) is float and type(value) is int):
+            got, expected = f"{json.dumps(value)} in the record", type(now).__name__
+            raise InputError(name, cut(got, 200), expected, "choose another store_folder")
+        stored[name] = type(now)(value)
+        if stored[name] != now:
+            differing.append(f"{name} is {cut(str(value), 100)!r} in the record, {cut(str(now), 100)!r} here")
+    return replace(settings, **stored), differing
 
 
 def problem_of(settings: CampaignParameters, model: Model | NotReady) -> CampaignProblem:
@@ -152,6 +200,8 @@ ANYWHERE = (
     Measurement.REJECTED_NOT_STORED,
 )
 """Rejections that another configuration would meet as well."""
+HALTED = {"stopped": "the robot was stopped", "beam_lost": "the beam was lost"}
+"""Ends of a goal after which a person has to look: what is said of each."""
 
 
 @dataclass
@@ -189,9 +239,8 @@ class Measuring:
     Attributes:
         visit: What is being measured; ``None`` if nothing is.
         waiting: What is awaited; empty if nothing is.
+        halted: Why the robot goes on only when a person says so; empty if it does by itself.
         taken: Name of the plan that the identifier has.
-        fit: The last plan of the fit that the identifier took; ``None`` if there is none that holds everything
-            that was measured for the fit.
     """
 
     def __init__(self, node: ManagedNode[CampaignParameters], plans: Publisher) -> None:
@@ -199,14 +248,13 @@ class Measuring:
         self._execution = PlanExecution(node, node.settings.value.execute_action)
         self.begin("")
 
-    def begin(self, campaign_id: str, fit_plan: tuple[str, Plan] | None = None) -> None:
-        """Begin a campaign, or go on with one of which the identifier took a plan of the fit."""
+    def begin(self, campaign_id: str) -> None:
+        """Begin a campaign, or go on with one."""
         self._id = campaign_id
-        self.fit = None if fit_plan is None else Announced(*fit_plan, (), FIT)
         self._plan: Announced | None = None
         self._plans: dict[str, Announced] = {}
         self.visit: Visit | None = None
-        self.waiting, self._waited_since, self._tried = "", 0.0, 0.0
+        self.waiting, self.halted, self._waited_since, self._tried = "", "", 0.0, 0.0
         self._spoilt = ""  # reason of ANYWHERE of the last standstill; empty once a measurement succeeded
 
     @property
@@ -221,20 +269,20 @@ class Measuring:
 
     def leave(self) -> None:
         """Measure nothing now: the robot stops."""
-        self.visit, self._spoilt = None, ""
+        self.visit, self._spoilt, self.halted = None, "", ""
         self._wait_for("")
         self._execution.poll(self._settings.silence)
         self._execution.cancel()
 
-    def joined(self) -> None:
-        """Forget what the identifier was told: measurements of a validation belong to the fit from now on."""
-        self.fit = self._plan = None
+    def tell_fit(self, state: CampaignState) -> None:
+        """Tell the identifier a plan of everything that is measured for the fit.
 
-    def back_to_fit(self, state: CampaignState) -> None:
-        """Tell the identifier the plan of the fit again."""
-        told = self._plan is not None and self._plan.role == FIT
-        if not told and state.measurements_of(FIT):
-            self._announce(self.fit or announced(state, self._id, FIT))
+        So it hears that a validation joined the fit, and has the plan of the fit in the end.
+        """
+        measured = {r.index for r in state.measurements_of(FIT)}
+        told = [p for p in self._plans.values() if p.role == FIT and measured <= set(p.numbers)]
+        if measured and (self._plan is None or self._plan not in told):
+            self._announce(told[-1] if told else announced(state, self._id, FIT))
 
     def heard(self, message: Measurement, state: CampaignState) -> CampaignState:
         """Take what the identifier publishes about a standstill.
@@ -295,20 +343,14 @@ class Measuring:
         return self._node.settings.value
 
     def _tell(self, state: CampaignState, visit: Visit) -> None:
-        """Announce the plan and wait until the identifier has it, before the robot goes there.
-
-        At the identifier a new plan begins with the measurements of the plan before. Therefore the plan of the
-        fit has to be taken before that of a validation; else the fit would begin with what was validated.
-        """
-        plan, number = self._plan, visit.action.index
-        role = visit.action.role if self.fit is not None else FIT
-        if plan is None or plan.role != role or (role == visit.action.role and not plan.covers(number, state)):
+        """Announce the plan and wait until the identifier has it, before the robot goes there."""
+        plan, role = self._plan, visit.action.role
+        if plan is None or plan.role != role or not plan.covers(visit.action.index, state):
             plan = announced(state, self._id, role)
             self._announce(plan)
         if self.taken == plan.plan_id:
             self._wait_for("")
-            self.fit = plan if role == FIT else self.fit
-            visit.next("sending" if role == visit.action.role else "telling", self._node.seconds)
+            visit.next("sending", self._node.seconds)
         elif self._node.seconds - visit.since > RETRY:
             own = f"{self._node.get_fully_qualified_name()}/plan"
             self._wait_for(f"{self._settings.identifier} does not take the plan: is it there, plan_topic {own}?")
@@ -317,7 +359,11 @@ class Measuring:
 
     def _announce(self, plan: Announced) -> None:
         self._plan, self._plans[plan.plan_id] = plan, plan
-        self._out.publish(plan_to_message(plan.plan, plan.plan_id, self._node.now, self._settings.frame_id))
+        self._out.publish(self._message(plan, plan.plan))
+
+    def _message(self, told: Announced, plan: Plan) -> PlanMessage:
+        stamp, frame = self._node.now, self._settings.frame_id
+        return plan_to_message(plan, told.plan_id, stamp, frame, self._id, told.role)
 
     def _send(self, visit: Visit) -> None:
         """Send the robot to the configuration."""
@@ -326,8 +372,7 @@ class Measuring:
         if not self._execution.ready:
             self._wait_for(f"nobody offers {settings.execute_action}: is the robot's node there?")
         elif not self.waiting or self._due():
-            part = plan.part(plan.numbers.index(visit.action.index))
-            goal = plan_to_message(part, plan.plan_id, self._node.now, settings.frame_id)
+            goal = self._message(plan, plan.part(plan.numbers.index(visit.action.index)))
             self._execution.send(ExecutePlan.Goal(plan=goal, dwell=duration_message(settings.dwell)))
             visit.next("moving", self._node.seconds)
 
@@ -341,6 +386,8 @@ class Measuring:
         elif ended.how == "aborted":
             self.visit = None
             return state.failed(index, ended.message or "the robot stopped")
+        elif ended.how in HALTED:
+            self.halted = f"{HALTED[ended.how]}: {ended.message or 'the robot says no more'}"
         else:
             self._wait_for(ended.message or f"{ended.how} by the robot")
             visit.next("sending", self._node.seconds)
@@ -399,8 +446,10 @@ def result_message(result: CampaignResult, campaign_id: str, frame_id: str) -> C
     return estimate_to_message(
         result.estimate,
         frame_id,
-        plan_id=campaign_id,
+        campaign_id=campaign_id,
         configurations=len(np.unique(configuration_labels(result.fit.q))),
+        rejected=result.spent - len(result.fit) - len(result.validation or ()),
+        condition=condition_of(result.estimate),
         complete=result.outcome == "reached",
         verdict=verdict_message(result.verdict),
     )
@@ -462,16 +511,20 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
         budget=problem.budget,
         validated=len(state.measurements_of(VALIDATION)),
         validation=problem.validation,
-        excluded=len(state.exclusions),
+        excluded=len(state.exclusions) + len(state.dropped),
         predicted_accuracy=NAN if last is None or math.isinf(last.accuracy) else last.accuracy,
         required_accuracy=problem.required_accuracy,
         sigma=NAN if last is None else last.sigma,
         validation_rms=NAN,
         validation_predicted_rms=NAN,
-        left_out_rms=NAN,
+        left_out_rms=NAN if last is None else last.left_out,
         round_measured=[r.measured for r in state.rounds],
         round_accuracy=[r.accuracy if math.isfinite(r.accuracy) else NAN for r in state.rounds],
         joint_names=list(problem.robot.joint_names),
+        ahead=list(state.ahead),
+        ahead_configurations=[
+            JointConfiguration(positions=state.configurations[i].q.tolist()) for i in state.ahead
+        ],
         reason=cut(in_ros("; ".join(filter(None, (waiting, reason, state.message))))),
     )
     if isinstance(action, Measure):
@@ -498,6 +551,8 @@ def _state(state: CampaignState, waiting: str) -> int:
 def _fill_result(message: CampaignStatus, result: CampaignResult) -> None:
     message.predicted_accuracy = NAN if math.isinf(result.accuracy) else result.accuracy
     message.verdict = verdict_message(result.verdict)
+    if result.estimate is not None:
+        message.left_out_rms = float(result.estimate.left_out.rms)
     validation = None if result.estimate is None else result.estimate.validation
     if validation is not None:
         message.validation_rms, message.validation_predicted_rms = validation.rms, validation.predicted_rms

@@ -116,6 +116,9 @@ RESULTS = {
     ExecutePlan.Result.CANCELLED: "cancelled",
     ExecutePlan.Result.ABORTED: "aborted",
     ExecutePlan.Result.BUSY: "busy",
+    ExecutePlan.Result.STOPPED: "stopped",
+    ExecutePlan.Result.BEAM_LOST: "beam_lost",
+    ExecutePlan.Result.NOT_READY: "not_ready",
 }
 
 

@@ -1,13 +1,13 @@
-"""What was measured of a campaign or a plan, and the estimate from it: the identifier without ROS, and its files.
+"""What was measured of a campaign or a plan, and the estimate from it: the identifier without ROS, its files.
 
-A session belongs to one campaign, whose plans share their measurements, or to one plan that is part of no campaign,
-or to none. A plan of another campaign, or with another name, begins a new session; one that comes back is met with
-what was measured of it. Everything is in the store before it counts here, so that a session made from the same
-store is the same session.
+A session belongs to one campaign, whose plans share their measurements, or to one plan that is part of no
+campaign, or to none. A plan of another campaign, or with another name, begins a new session; one that comes back
+is met with what was measured of it. Everything is in the store before it counts here, so that a session made
+from the same store is the same session.
 
 What was measured for a validation takes no part in the fit: it is held out, and tells the error of the estimate
-beside it. It joins the fit when a plan for the fit, of the same campaign, wants its configuration measured and has
-no other measurement of it: so a campaign says that a validation contradicted the estimate.
+beside it. It joins the fit when a plan for the fit, of the same campaign, wants its configuration measured and
+has no other measurement of it: so a campaign says that a validation contradicted the estimate.
 
 A recording that is played twice, or two that overlap, count once: the robot cannot stand still twice at the same
 time. A standstill whose stamps overlap those of a measurement at the same place *is* that measurement, also after

@@ -152,7 +152,11 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
         0.01, "largest joint difference to a planned configuration", "rad or m", 1e-6, 1.0
     )
     accept_unplanned: bool = parameter(False, "accept standstills at configurations that are in no plan")
-    keep_measurements: bool = parameter(False, "a new plan begins with the measurements of the plan before")
+    keep_measurements: bool = parameter(
+        False,
+        "a new plan begins with the measurements of the plan before, if both are part of no campaign; plans of "
+        "one campaign share their measurements anyway",
+    )
     most_measurements: int = parameter(5000, "largest number of measurements in use", "", 1, 1000000)
     store_folder: str = parameter(
         "",
@@ -296,6 +300,11 @@ class CampaignParameters(PlanParameters):
         "",
         "folder of the campaign and its results, which a restart goes on with; empty = lost with the node",
         read_only=True,
+    )
+    review: bool = parameter(
+        False,
+        "wait for ~/resume after the first plan, so that its configurations can be looked at, and left out or "
+        "replaced with ~/skip_configuration",
     )
     execute_action: str = at_configure("tracker_simulator/execute_plan", "action ExecutePlan of the robot")
     identifier: str = at_configure(

@@ -26,7 +26,7 @@ from calib_planner.campaign import (
     begin,
 )
 from calib_planner.errors import InputError, StoreError
-from calib_planner.io import CampaignStore, begin_campaign, open_campaign
+from calib_planner.io import CampaignStore, begin_campaign, open_campaign, stored_goals
 from calib_planner.io.store import CAMPAIGN_FILE as FILE
 from calib_planner.io.store import JOURNAL, StoredCampaign
 
@@ -98,11 +98,12 @@ def test_the_requirements_are_kept(tmp_path: Path) -> None:
     database = sqlite3.connect(tmp_path / FILE)
     assert database.execute("SELECT version FROM settings").fetchall() == [("1.2.3",)]
     database.close()
-    with reopened(tmp_path) as stored:
-        assert stored.goals == GOALS
+    assert stored_goals(tmp_path) == GOALS
     old_journal(tmp_path / "old")
-    with reopened(tmp_path / "old") as stored:
-        assert stored.goals == {}
+    assert stored_goals(tmp_path / "old") == {} and stored_goals(tmp_path / "none") is None
+    with reopened(tmp_path / "old"):
+        pass
+    assert stored_goals(tmp_path / "old") == {}
 
 
 def test_a_measurement_told_again_replaces_the_former(tmp_path: Path) -> None:
@@ -304,7 +305,10 @@ def test_another_robots_record_is_refused(tmp_path: Path, converted: bool) -> No
 
 def test_a_record_in_use_is_left_alone(tmp_path: Path) -> None:
     store, state = noted(tmp_path)
-    for attempt in (lambda: begin_campaign(tmp_path, "def", ROBOT, GOALS, ""), lambda: open_campaign(tmp_path, ROBOT)):
+    for attempt in (
+        lambda: begin_campaign(tmp_path, "def", ROBOT, GOALS, ""),
+        lambda: open_campaign(tmp_path, ROBOT),
+    ):
         with pytest.raises(InputError, match="another process uses"):
             attempt()
     store.note(state, state.measured(5, Q[5], POINTS[5], 16))

@@ -21,7 +21,7 @@ from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import EVENTS, LATCHED
 
-IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
+IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan"}
 SIMULATOR = {"robot": "planar_2r", "error_model": "paper", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 VALIDATION = 3
 """Configurations of a validation, as the desk asks for them."""
@@ -52,12 +52,14 @@ def restart(desk: Desk) -> None:
 
 def told(plans: list[PlanMessage]) -> list[tuple[str, int]]:
     """Role and measurements of the plans, in the order of telling; those told again at once only once."""
-    found = {m.plan_id: (m.plan_id.split("-")[1], sum(m.repetitions)) for m in plans}
+    role = {PlanMessage.FIT: "fit", PlanMessage.VALIDATION: "validation"}
+    found = {m.plan_id: (role[m.purpose], sum(m.repetitions)) for m in plans}
     ids = [m.plan_id for k, m in enumerate(plans) if k == 0 or plans[k - 1].plan_id != m.plan_id]
     return [found[i] for i in ids]
 
 
 def test_the_identifier_is_told_the_fit_that_grew(bench: Bench, cell: FakeCell, contradicts: list[bool]) -> None:
+    """As soon as the validation has joined it, and in the end."""
     desk = Desk(bench)
     assert desk.call("start")[0]
     done = desk.until(S.DONE)
@@ -66,8 +68,9 @@ def test_the_identifier_is_told_the_fit_that_grew(bench: Bench, cell: FakeCell, 
     bench.wait(lambda: told(cell.plans)[-2:] == [("validation", VALIDATION), ("fit", grown)])
     roles = [role for role, _ in told(cell.plans)]
     assert told(cell.plans)[-3] == ("fit", grown) and roles.count("validation") == 2
+    assert {m.campaign_id for m in cell.plans} == {done.campaign_id}
     state = desk.node.campaign
-    plan = next(m for m in reversed(cell.plans) if "-fit-" in m.plan_id)
+    plan = next(m for m in reversed(cell.plans) if m.purpose == PlanMessage.FIT)
     np.testing.assert_array_equal(
         np.unique([c.positions for c in plan.configurations], axis=0),
         np.unique([r.q for r in state.measurements_of(FIT)], axis=0),
@@ -76,42 +79,16 @@ def test_the_identifier_is_told_the_fit_that_grew(bench: Bench, cell: FakeCell, 
     assert len(numbers) == len(set(numbers)) == len(cell.visited) == grown + VALIDATION
 
 
-def test_no_validation_is_told_before_the_fit_that_grew_is_taken(
-    bench: Bench, cell: FakeCell, contradicts: list[bool]
-) -> None:
-    desk = Desk(bench)
-    last = VALIDATION - 1
-
-    def answer(q: np.ndarray) -> str:
-        validated = desk.now.validated if "-validation-" in cell.plans[-1].plan_id else 0
-        if contradicts and validated == last:
-            cell.takes_plans = False
-        return "ok"
-
-    cell.answer = answer
-    assert desk.call("start")[0]
-    waiting = desk.until(S.WAITING, said="does not take the plan")
-    grown = len(cell.visited)
-    assert waiting.measured == grown and waiting.validated == 0
-    assert told(cell.plans)[-2:] == [("validation", VALIDATION), ("fit", grown)]
-    count = len(cell.plans)
-    bench.wait(lambda: len(cell.plans) > count + 1)
-    assert {told([m])[0] for m in cell.plans[count:]} == {("fit", grown)} and len(cell.visited) == grown
-    cell.takes_plans = True
-    done = desk.until(S.DONE)
-    assert done.measured == grown and done.validated == VALIDATION
-
-
 @pytest.mark.parametrize("validated", [0, 1], ids=["before the validation", "in the validation"])
-def test_after_a_restart_the_same_fit_is_told(
+def test_a_restart_goes_on_in_the_validation(
     bench: Bench, cell: FakeCell, contradicts: list[bool], tmp_path: Path, validated: int
 ) -> None:
-    """The plan of the fit that the identifier took keeps its name, and with it what is measured of it."""
+    """Nothing is measured twice, and the identifier hears of everything that is in the fit."""
     desk = Desk(bench, store_folder=str(tmp_path))
     held = {"on": True}
 
     def answer(q: np.ndarray) -> str:
-        in_second = not contradicts and "-validation-" in cell.plans[-1].plan_id
+        in_second = not contradicts and cell.plans[-1].purpose == PlanMessage.VALIDATION
         return "hang" if held["on"] and in_second and desk.now.validated == validated else "ok"
 
     cell.answer = answer
@@ -120,15 +97,13 @@ def test_after_a_restart_the_same_fit_is_told(
     bench.wait(lambda: not contradicts)
     before = desk.until(S.VALIDATING, validated=validated)
     bench.wait(lambda: len(cell.visited) == before.measured + validated + 1)
-    fit = next(m.plan_id for m in reversed(cell.plans) if "-fit-" in m.plan_id)
     restart(desk)
     count, held["on"] = len(cell.plans), False
+    assert desk.now.round == before.round and list(desk.now.round_measured) == list(before.round_measured)
     assert desk.call("resume")[0]
     done = desk.until(S.DONE)
     assert done.measured == before.measured and done.validated == VALIDATION
-    bench.wait(lambda: "-fit-" in cell.plans[-1].plan_id)
-    assert {m.plan_id for m in cell.plans[count:] if "-fit-" in m.plan_id} == {fit}
-    assert told(cell.plans[count:]) == [("validation", VALIDATION), ("fit", before.measured)]
+    bench.wait(lambda: told(cell.plans[count:]) == [("validation", VALIDATION), ("fit", before.measured)])
 
 
 # ── with the real identifier ─────────────────────────────────────────────────────────────────────────
@@ -140,6 +115,7 @@ def measured_in_the_end(bench: Bench, desk: Desk, identified: list[CalibrationEs
     assert done.outcome == S.OUTCOME_REACHED and done.validated == VALIDATION
     bench.wait(lambda: "-fit-" in identified[-1].plan_id)
     assert identified[-1].measurements + identified[-1].outliers == done.measured
+    assert identified[-1].campaign_id == done.campaign_id
     return done
 
 

@@ -32,7 +32,7 @@ from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
 
-IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
+IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan"}
 SIMULATOR = {"robot": "planar_2r", "error_model": "paper", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 
 

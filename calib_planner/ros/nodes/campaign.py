@@ -3,15 +3,13 @@
 The library's ``campaign`` says what is to be done next (a pure state machine); plans are made by the library in a
 thread of their own. This file carries it out: ``Measuring`` tells the identifier the plan (latched ``~/plan``,
 the identifier's ``plan_topic``), sends the robot to one configuration at a time, and listens to what was
-accepted. The identifier has to keep its measurements when a plan comes (``keep_measurements``): every plan of the
-fit holds everything that was measured before. The plan of the validation holds the validation only; after it the
-plan of the fit is announced again, so that in the end the identifier's own estimate, too, is that of the fit.
-When a validation joins the fit, the identifier has to take a plan of the fit that holds it before the next
-validation is announced. The store keeps the plan of the fit that was taken, so that after a restart the same
-plan is announced again.
+accepted. Every plan names the campaign, whose plans share their measurements at the identifier, and says whether
+it is for the fit or for the validation. A plan of the fit holds everything that was measured for it; one is told
+when a validation joins the fit, and in the end.
 
-The robot is sent nowhere before ``~/start``, nor after a restart before ``~/resume``. All callbacks take turns in
-one thread.
+The robot is sent nowhere before ``~/start``, nor after a restart before ``~/resume``; with ``review`` nor before
+the first plan was looked at. A campaign goes on after a restart with what it had to reach when it began, and says
+which parameters differ from that. All callbacks take turns in one thread.
 """
 
 from __future__ import annotations
@@ -24,6 +22,7 @@ from functools import partial
 
 from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
+from calib_planner_msgs.srv import SkipConfiguration
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
@@ -39,13 +38,15 @@ from calib_planner.campaign import (
     decide,
 )
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
-from calib_planner.io import CampaignStore, begin_campaign, open_campaign
+from calib_planner.io import CampaignStore, begin_campaign, open_campaign, stored_goals
 from calib_planner.ros.campaign import (
     Measuring,
+    goals_of,
     idle_status,
     problem_of,
     result_message,
     status_message,
+    with_goals,
     write_result,
 )
 from calib_planner.ros.lifecycle import ManagedNode, reason_of
@@ -54,7 +55,7 @@ from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import CampaignParameters
-from calib_planner.units import cut
+from calib_planner.units import cut, listed
 
 PERIOD = 0.05
 """Time between two looks at what there is to do [s]."""
@@ -83,7 +84,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self.campaign: CampaignState | None = None
         self._let_go()
         self._id, self._reason, self._sent = "", "call ~/start", ""
-        self._reported = False
+        self._reported = self._reviewed = self._replanning = False
 
     def _let_go(self) -> None:
         """Close the campaign's file."""
@@ -105,6 +106,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self.create_subscription(CalibrationEstimate, f"{name}/estimate", self._on_estimate, LATCHED)
         for name in ("start", "pause", "resume", "skip"):
             self.create_trigger(f"~/{name}", partial(self._serve, getattr(self, f"_{name}")))
+        self.create_service(SkipConfiguration, "~/skip_configuration", self._on_skip)
 
     def activate(self) -> None:
         """Go on with the campaign; one in the store waits for ``~/resume``."""
@@ -138,9 +140,13 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         chosen, model = self.settings.value, self._source.model
         if self.campaign is not None or not chosen.store_folder or not isinstance(model, Model):
             return
-        if not chosen.test_pose_rows:
-            return
         try:
+            goals = stored_goals(chosen.store_folder)
+            if goals is None:
+                return
+            chosen, differing = with_goals(chosen, goals)
+            if not chosen.test_pose_rows:
+                return
             problem = problem_of(chosen, model)
             stored = open_campaign(chosen.store_folder, problem.robot)
             if stored is None:
@@ -156,8 +162,11 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             self.get_logger().error(self._reason)
             return
         self._id = stored.campaign_id
-        self._measuring.begin(self._id, stored.fit_plan)
+        self._measuring.begin(self._id)
         self._reason = f"{len(stored.rows)} measurements of campaign {self._id} are there: call ~/resume to go on"
+        if differing:
+            text = f"as its record says ({'; '.join(differing)}); to change that, choose another store_folder"
+            self._reason = f"{self._reason} {text}"
 
     def _serve(self, action: Callable[[], str]) -> str:
         try:
@@ -173,12 +182,12 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             )
         if self._work is not None or self._measuring.busy:
             raise InputError("start", "what was stopped has not ended", "nothing under way", "ask again")
-        problem = problem_of(self.settings.value, self._source.model)
-        folder = self.settings.value.store_folder
+        chosen = self.settings.value
+        problem, folder = problem_of(chosen, self._source.model), chosen.store_folder
         name = uuid.uuid4().hex[:12]
         if self._store is not None:
             self._store.close()  # the new campaign takes its place; if that fails, the next measurement says so
-        store = begin_campaign(folder, name, problem, __version__) if folder else None
+        store = begin_campaign(folder, name, problem.robot, goals_of(chosen), __version__) if folder else None
         self._forget()
         self._id, self._store, self.campaign = name, store, begin(problem)
         self._measuring.begin(name)
@@ -207,6 +216,36 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             raise InputError("skip", "no configuration is being measured", "one that is", "see ~/status")
         self._set(state.skipped(visit.action.index))
         return f"configuration {visit.action.index} and what is near it are left out"
+
+    def _on_skip(
+        self, request: SkipConfiguration.Request, response: SkipConfiguration.Response
+    ) -> SkipConfiguration.Response:
+        kind, index = SkipConfiguration.Response, request.configuration_index
+        response.status = kind.NOT_ACTIVE
+        try:
+            self.check_active()
+            state = self._running("skip_configuration")
+            response.status = kind.UNKNOWN_INDEX
+            if index not in state.queue:
+                expected = (
+                    f"one of {listed(map(str, dict.fromkeys(state.queue)))}" if state.queue else "one ahead"
+                )
+                raise InputError("configuration_index", index, expected, "see ahead on ~/status")
+            after = state.skipped(index, replan=request.replace)
+            response.status = kind.NOT_STORED
+            if not self._stored(lambda store: store.note(state, after)):
+                self.campaign = state.pause()
+                raise InputError(
+                    "store_folder", "no space or no disk", "one that can be written to", self._reason
+                )
+            self.campaign, self._replanning = after, self._replanning or request.replace
+            rest = "the rest is planned anew" if request.replace else f"{len(set(after.ahead))} others stay"
+            response.message = f"configuration {index} and what is near it are left out; {rest}"
+            response.status = kind.SUCCESS
+        except InputError as error:
+            response.message = cut(error)
+        self._publish_status()
+        return response
 
     def _running(self, what: str) -> CampaignState:
         if self.campaign is None or self.campaign.result is not None:
@@ -262,18 +301,17 @@ class CampaignNode(ManagedNode[CampaignParameters]):
     def _go_on(self, state: CampaignState) -> None:
         action, measuring = state.action, self._measuring
         if isinstance(action, Measure):
-            before = measuring.fit
             self._set(measuring.step(state, action))
-            new = None if measuring.fit is before else measuring.fit
-            if new is not None and not self._stored(lambda store: store.note_plan(new.plan_id, new.plan)):
-                self._set(state.pause())
-            if measuring.waited > self.settings.value.longest_wait:
+            if measuring.halted:
+                self._pause_for(f"{measuring.halted}; call ~/resume once that is remedied")
+            elif measuring.waited > self.settings.value.longest_wait:
                 self._pause_for(f"{measuring.waiting}; call ~/resume once that is remedied")
             return
         measuring.leave()
+        wanted = not isinstance(action, Paused) or (self._replanning and not state.queue)
         if isinstance(action, Finished):
             self._finish(action.result)
-        elif not isinstance(action, Paused) and self._work is None:
+        elif wanted and self._work is None:
             self._work, self._work_for = self._thread.submit(decide, state, self._ending_plan.is_set), self._id
 
     def _take_step(self) -> None:
@@ -282,6 +320,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         work, self._work = self._work, None
         if self._work_for != self._id:
             return  # of a campaign that was left
+        self._replanning = False
         try:
             step = work.result()
         except Exception as error:
@@ -289,8 +328,21 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             return
         self._set(self.campaign.decided(step))
         if step.joins:
-            self._measuring.joined()
+            self._measuring.tell_fit(self.campaign)
         self.get_logger().info(f"round {len(self.campaign.rounds)}: {step.message}")
+        self._review()
+
+    def _review(self) -> None:
+        """With ``review``: pause once, when the first plan is there and before anything is measured."""
+        state = self.campaign
+        first = state is not None and bool(state.queue) and not state.measurements and not self._reviewed
+        if state is None or not first or not self.settings.value.review:
+            return
+        self._reviewed = True
+        self._set(state.pause())
+        text = "look at what is ahead on ~/status, leave out or replace with ~/skip_configuration"
+        self._reason = f"paused for review: {text}, then call ~/resume"
+        self.get_logger().info(self._reason)
 
     def _pause_for(self, reason: str) -> None:
         self._reason = f"paused: {cut(reason, 800)}"
@@ -312,7 +364,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
             message.header.stamp = stamp_message(self.now)
             self._estimates.publish(message)
         if self.campaign is not None:
-            self._measuring.back_to_fit(self.campaign)
+            self._measuring.tell_fit(self.campaign)
         folder = self.settings.value.store_folder
         if folder:
             try:

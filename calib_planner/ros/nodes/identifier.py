@@ -25,6 +25,7 @@ from std_msgs.msg import String
 
 from calib_planner import __version__
 from calib_planner.acquisition import Intake, PointLike, Rejection, Standstill
+from calib_planner.campaign import FIT
 from calib_planner.errors import CalibPlannerError, InputError, StoreError
 from calib_planner.identification import Estimate
 from calib_planner.io import (
@@ -77,7 +78,9 @@ class IdentifierOutput:
             record.frame or "tracker",
             status=record.status,
             reason=record.reason,
-            plan_id=session.plan_id if record.index is not None else "",
+            plan_id=session.plan_id_of(record),
+            campaign_id=session.campaign_id,
+            purpose=record.role,
             index=record.index,
             repetition=record.repetition,
             number=record.number,
@@ -90,16 +93,18 @@ class IdentifierOutput:
         """The estimate, or why there is none; ``frame_id`` is the robot's base."""
         others = {
             "plan_id": session.plan_id,
+            "campaign_id": session.campaign_id,
             "configurations": session.configurations,
             "rejected": session.rejections.total(),
             "complete": session.complete,
         }
+        fitted = session.of(FIT)
         if isinstance(estimate, Estimate):
             message = estimate_to_message(estimate, frame_id, condition=condition_of(estimate), **others)
         else:
             message = CalibrationEstimate(
                 robot=session.robot.name,
-                measurements=sum(int((r.standstill.samples > 0).sum()) for r in session.accepted),
+                measurements=sum(int((r.standstill.samples > 0).sum()) for r in fitted if r.status == ACCEPTED),
                 status=ESTIMATE_STATUS["too_few" if estimate.missing else "error"],
                 message=in_ros(estimate.message),
                 **dict.fromkeys(ESTIMATE_NUMBERS, NAN),
@@ -108,7 +113,7 @@ class IdentifierOutput:
             message.header.frame_id = frame_id
             if not estimate.missing:
                 self._log().error(estimate.message)
-        message.header.stamp = stamp_message(session.records[-1].acquired.end if session.records else 0)
+        message.header.stamp = stamp_message(fitted[-1].acquired.end if fitted else 0)
         self._estimates.publish(message)
 
     def description(self, urdf: str, estimate: Estimate | TooFew) -> None:
@@ -250,14 +255,22 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             return
         before = len(session.records)
         try:
-            keep = chosen.keep_measurements
-            if not session.begin(received.plan_id, received.plan, chosen.plan_tolerance, keep=keep):
+            new = session.begin(
+                received.plan_id,
+                received.plan,
+                chosen.plan_tolerance,
+                campaign_id=received.campaign_id,
+                role=received.purpose,
+                keep=chosen.keep_measurements,
+            )
+            if not new:
                 return
         except CalibPlannerError as error:
             self._refuse_plan(received.plan_id, error)
             return
-        name = f"plan {brief(received.plan_id, 40)}"
-        text = f"{name}: {received.plan.measurements} measurements, {len(session.records)} of them there"
+        name = f"plan {brief(received.plan_id, 40)} for {received.purpose}"
+        there = sum(session.done().values())
+        text = f"{name}: {received.plan.measurements} measurements, {there} of them there"
         self.get_logger().info(f"{text}; {before} were there of the plan before" if before else text)
         self._keep_frame()
         self._update()
