@@ -954,9 +954,10 @@ def _role(name: object) -> str:
 
 
 def _round(values: Mapping[str, Any]) -> Round:
-    """A round out of JSON, in which numbers that are not finite are null: nothing was identified then."""
-    unknown: dict[str, Any] = {"accuracy": float("inf"), "left": float("inf"), "floor": float("nan")}
-    unknown |= {"sigma": float("nan"), "left_out": float("nan")}
+    """A round out of JSON, in which numbers that are not finite are null."""
+    nan, inf = float("nan"), float("inf")
+    unknown: dict[str, Any] = {"accuracy": inf, "floor": nan, "sigma": nan, "left_out": nan}
+    unknown["left"] = inf if values["measured"] else nan
     return Round(**{name: unknown[name] if value is None else value for name, value in values.items()})
 
 

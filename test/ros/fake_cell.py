@@ -27,13 +27,21 @@ from calib_planner.simulation import SimulatedCell, random_deviations
 
 Answer = Callable[[np.ndarray], str]
 KIND = ExecutePlan.Result
-STATUS = {"refuse": KIND.INVALID_PLAN, "abort": KIND.ABORTED, "busy": KIND.BUSY, "nonsense": 255}
+STATUS = {
+    "refuse": KIND.INVALID_PLAN,
+    "abort": KIND.ABORTED,
+    "busy": KIND.BUSY,
+    "stopped": KIND.STOPPED,
+    "beam_lost": KIND.BEAM_LOST,
+    "not_ready": KIND.NOT_READY,
+    "nonsense": 255,
+}
 
 
 class FakeCell(Node):
     """``answer`` says what becomes of a configuration (joints,):
 
-    ``ok``, ``refuse`` (INVALID_PLAN), ``abort``, ``busy``, ``nonsense`` (no status there is), ``reject``
+    ``ok``, ``refuse`` (INVALID_PLAN), a status by its name, ``nonsense`` (no status there is), ``reject``
     (measured, not accepted), ``ignore`` (nothing is published), ``hang`` (no end, no feedback until cancelled).
     """
 
