@@ -140,11 +140,11 @@ class Session:
 
     def _enter(self, stored: StoredSession, *, begun: bool = True) -> None:
         """Go on with a session; ``begun``: the store knows its plan."""
-        kept = [r for r in stored.records if r.status in KEPT]
+        in_use = [r for r in stored.records if r.status in KEPT]
         others = [r for r in stored.records if r.status not in KEPT]
         self.number, self.campaign_id, self.plans = stored.number, stored.campaign_id, stored.plans
         self._begun, self._undecided = begun and stored.number > 0, list[Record]()
-        self.records, self._others = kept, Counter(r.status for r in others)
+        self.records, self._others = in_use, Counter(r.status for r in others)
         self._withdrawn = [r for r in others if r.status == UNDONE]
         self._refused = {_marks(r): r.number for r in others}
         self._unsaved: dict[int, Record] = {}
@@ -567,8 +567,8 @@ LONGEST_NAME = 40
 def save(folder: str, session: Session, how: Matching, urdf: str = "") -> list[Path]:
     """Write what was measured, and the estimate, as far as there are any; returns the paths.
 
-    ``measurements_PLAN.csv`` holds what is fitted, ``validation_PLAN.csv`` what is held out, ``estimate_PLAN.yaml``
-    the estimate with its error on what is held out. PLAN is the plan for the fit.
+    ``measurements_PLAN.csv`` holds what is fitted, ``validation_PLAN.csv`` what is held out, and
+    ``estimate_PLAN.yaml`` the estimate with its error on what is held out. PLAN is the plan for the fit.
 
     Args:
         folder: The folder that the user chose.

@@ -111,7 +111,7 @@ def test_a_name_belongs_to_one_plan_of_one_campaign_and_role() -> None:
         ("one-validation", "one", FIT, HELD_OUT),
         ("x", "y" * 501, FIT, PLAN),
     ]:
-        with pytest.raises(InputError, match="plan_id|campaign_id"):
+        with pytest.raises(InputError, match=r"plan_id|campaign_id"):
             session.begin(name, plan, NEAR, campaign_id=campaign, role=role)
         assert told(session) == before
 
