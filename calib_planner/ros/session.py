@@ -205,7 +205,7 @@ class Session:
         return True
 
     def _take_plan(self, new: NamedPlan, tolerance: float) -> None:
-        """Measure a plan of this session from now on; measurements belong to its rows, as far as they are near."""
+        """Measure a plan of this session from now on; measurements near its rows belong to them."""
         before = next((p for p in self.plans if p.role == new.role), None)
         self.plans = (*(p for p in self.plans if p.role != new.role), new)
         if before is None or before.plan_id != new.plan_id:
@@ -277,9 +277,9 @@ class Session:
         """The measurement that a standstill is: at the same time and place."""
         for record in (*self.records, *self._withdrawn):
             one = record.standstill
-            if one.start <= standstill.end and standstill.start <= one.end:
-                if np.abs(one.joints - standstill.joints).max() <= tolerance:
-                    return record
+            overlapping = one.start <= standstill.end and standstill.start <= one.end
+            if overlapping and np.abs(one.joints - standstill.joints).max() <= tolerance:
+                return record
         return None
 
     def _forget(self, record: Record) -> None:
@@ -439,8 +439,8 @@ class Session:
     def estimate(self, how: Matching, *, settled: bool = False) -> Estimate | TooFew:
         """Identify with the measurements for the fit: in full if ``settled``, from few, and for a complete plan.
 
-        What is held out tells the error beside it (``Estimate.validation``). While nothing but that comes, the fit
-        is not made anew.
+        What is held out tells the error beside it (``Estimate.validation``); while only that comes, the fit is
+        not made anew.
         """
         known = self._fit
         if known is None or not how.fits_like(known[0]) or (settled and not self.settled):
