@@ -333,6 +333,8 @@ class StandstillDetector:
     def _process(self, *, everything: bool = False) -> list[Standstill | Rejection]:
         results: list[Standstill | Rejection] = []
         for stamp, stream, value in self._order.ready(everything=everything):
+            if self._waiting and stamp < self._waiting[-1][1]:
+                self._on_points()  # a clock was set back: these are from before
             if stream >= self.joint_count:
                 self._waiting.append((stream - self.joint_count, stamp, value))
                 results += self._on_silence(stamp)

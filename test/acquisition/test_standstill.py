@@ -224,6 +224,16 @@ def test_nan_joints_are_reported() -> None:
     one_rejection(feed(StandstillDetector(2), blind), RejectionReason.NOT_FINITE)
 
 
+@pytest.mark.parametrize("joint_rate", [50, 100])
+def test_a_recording_played_again_shows_the_same_standstills(joint_rate: int) -> None:
+    """Points that still waited for joints when the stamps began anew do not keep the later ones back."""
+    detector, messages = StandstillDetector(2), stream([0.0, 0.7, -0.4], joint_rate=joint_rate)
+    first, again = (feed(detector, messages, flush=False) for _ in range(2))
+    assert [r.joints.tolist() for r in again] == [r.joints.tolist() for r in first] and len(first) == 3
+    for one, other in zip(first, again, strict=True):
+        assert isinstance(other, Standstill) and one.start <= other.end and other.start <= one.end
+
+
 def test_clock_set_back_recovers() -> None:
     detector = StandstillDetector(2)
     check_stops(feed(detector, stream([0.0, 0.5])), [0.0, 0.5])
