@@ -59,6 +59,16 @@ class Desk:
             return response.success, response.message
         raise AssertionError(f"{name} is not answered")
 
+    def transitions(self, *labels: str) -> None:
+        """Have the node make transitions, in its own thread: what it makes anew there is heard at once."""
+        for label in labels:
+            assert self.bench.change_state(NAME, 0, label), label
+
+    def restart(self) -> None:
+        """As after a crash: nothing is left of the node but its store."""
+        self.transitions("deactivate", "cleanup", "configure", "activate")
+        self.until(S.PAUSED)
+
     @property
     def now(self) -> CampaignStatus:
         return self.heard[-1]

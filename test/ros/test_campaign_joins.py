@@ -43,13 +43,6 @@ def cell(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> FakeCell:
     return bench.start(FakeCell)
 
 
-def restart(desk: Desk) -> None:
-    """As after a crash: nothing is left of the node but its journal."""
-    for step in ("deactivate", "cleanup", "configure", "activate"):
-        getattr(desk.node, f"trigger_{step}")()
-    desk.until(S.PAUSED)
-
-
 def told(plans: list[PlanMessage]) -> list[tuple[str, int]]:
     """Role and measurements of the plans, in the order of telling; those told again at once only once."""
     role = {PlanMessage.FIT: "fit", PlanMessage.VALIDATION: "validation"}
@@ -97,7 +90,7 @@ def test_a_restart_goes_on_in_the_validation(
     bench.wait(lambda: not contradicts)
     before = desk.until(S.VALIDATING, validated=validated)
     bench.wait(lambda: len(cell.visited) == before.measured + validated + 1)
-    restart(desk)
+    desk.restart()
     count, held["on"] = len(cell.plans), False
     assert desk.now.round == before.round and list(desk.now.round_measured) == list(before.round_measured)
     assert desk.call("resume")[0]
@@ -144,7 +137,7 @@ def test_so_it_does_after_a_restart_in_the_validation(
     desk.until(S.VALIDATING, 60.0, validated=1)
     assert desk.call("pause")[0]
     bench.wait(lambda: not desk.node._measuring.busy)
-    restart(desk)
+    desk.restart()
     count = len(plans)
     assert desk.call("resume")[0]
     measured_in_the_end(bench, desk, identified)

@@ -174,12 +174,10 @@ def test_a_restart_goes_on_with_the_goals_of_the_record(bench: Bench, cell: Fake
     node = desk.node
     spent, rounds = node.campaign.spent(), node.campaign.rounds
     assert spent == before.measured + 2 and before.excluded == 1
-    for step in ("deactivate", "cleanup"):
-        getattr(node, f"trigger_{step}")()
+    desk.transitions("deactivate", "cleanup")
     changes = {"budget": 50, "required_accuracy": 1e-3, "test_poses": "", "seed": 0}
     assert all(r.successful for r in node.set_parameters([Parameter(n, value=v) for n, v in changes.items()]))
-    for step in ("configure", "activate"):
-        getattr(node, f"trigger_{step}")()
+    desk.transitions("configure", "activate")
     again = desk.until(S.PAUSED, measured=before.measured)
     for text in (
         "budget is '40' in the record, '50' here",
