@@ -35,14 +35,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, CampaignStatus, Measurement, Verdict
 from std_srvs.srv import Trigger
 
 from calib_planner import Robot
 from calib_planner.errors import CalibPlannerError
 from calib_planner.io import read_data
 from calib_planner.ros.demo import DemoClient
-from calib_planner.ros.messages import estimate_from_message
+from calib_planner.ros.messages import LEVELS, estimate_from_message
 from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.processes import Nodes, own_domain
 from calib_planner.simulation import Faults, random_deviations
@@ -93,13 +93,14 @@ def cases() -> dict[str, Faults]:
 
 
 def given(faults: Faults, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
-    """Parameters of each node."""
+    """Parameters of each node; robots err by their parameters alone, and the nodes know that."""
     usual = asdict(Faults())
     off = {name: value for name, value in asdict(faults).items() if value != usual[name]}
     simulator = {"robot": ROBOT, "error_model": "paper", "seed": seed, "joint_speed": 12.0, "dwell": 0.5}
-    identifier = {"robot": ROBOT, "plan_topic": f"{NAME}/plan", "keep_measurements": True}
+    identifier = {"robot": ROBOT, "error_model": "paper", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
     campaign = {
         "robot": ROBOT,
+        "error_model": "paper",
         "test_poses": "'" + " ".join(map(str, POSE)) + "'",
         "sigma": 7e-6,
         "required_accuracy": 5e-6,
@@ -258,13 +259,14 @@ def describe(found: Run, desk: Desk) -> None:
     if desk.heard:
         last = desk.heard[-1]
         found.outcome, found.measured, found.validated = last.outcome, last.measured, last.validated
-        found.excluded, found.reasons = last.excluded, [last.reason, *last.reasons]
+        why = [f"{r.code}: {r.text}" for r in last.verdict.reasons if r.level != Verdict.PASS]
+        found.excluded, found.reasons = last.excluded, [last.reason, *why]
 
 
 def judge(found: Run, desk: Desk, folder: Path) -> None:
     """Verdict against truth, what was told against what was kept."""
     last = desk.heard[-1]
-    found.end = last.verdict
+    found.end = next(name for name, level in LEVELS.items() if level == last.verdict.level)
     if last.state != S.DONE:
         found.end, found.why = "wrong", f"paused again: {last.reason}"
     if desk.results:

@@ -1,0 +1,29 @@
+"""Some of bench/faults_nodes.py: campaigns with faults through the nodes, on a clock that waits for them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from robots import repeats
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
+import faults_nodes
+
+SAMPLE = ["beam_breaks", "reseat_0.03mm"]
+SEED = 100
+"""The bench begins at 0."""
+
+
+@pytest.mark.parametrize("fault", repeats(SAMPLE, list(faults_nodes.cases())))
+def test_no_campaign_with_a_fault_is_wrong_lost_or_hung(fault: str, tmp_path: Path) -> None:
+    found = faults_nodes.run(fault, SEED, tmp_path)
+    assert found.end in ("PASS", "WARN", "FAIL"), found
+    assert found.measured >= 4 and found.validated == 4
+
+
+def test_the_same_seed_gives_the_same_campaign(tmp_path: Path) -> None:
+    one, other = (faults_nodes.run("dropouts_30%", SEED, tmp_path / name) for name in ("one", "other"))
+    assert one.end == other.end == "PASS"
+    assert (one.worst, one.at_pose, one.told) == (other.worst, other.at_pose, other.told)
