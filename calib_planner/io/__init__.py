@@ -96,6 +96,7 @@ if TYPE_CHECKING:
     from calib_planner.io.understanding import BagTopics, JointTable, Reading, Source, Understanding
     from calib_planner.io.urdf import (
         calibrated_urdf,
+        parse_chain,
         parse_speed_limits,
         parse_urdf,
         read_chain,
@@ -129,8 +130,8 @@ else:
             "begin_campaign open_campaign open_store stored_goals stored_model",
             "text": "check_writable fresh_folder make_folder read_text user_path write_text",
             "understanding": "BagTopics JointTable Reading Source Understanding",
-            "urdf": "calibrated_urdf parse_speed_limits parse_urdf read_chain read_speed_limits require_urdf "
-            "write_calibrated_urdf",
+            "urdf": "calibrated_urdf parse_chain parse_speed_limits parse_urdf read_chain read_speed_limits "
+            "require_urdf write_calibrated_urdf",
             "urdf_tree": "UrdfChain",
             "xacro": "read_urdf_text split_arguments",
         },

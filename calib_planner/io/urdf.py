@@ -102,7 +102,16 @@ def read_chain(source: str | Path, base_link: str | None = None, tip_link: str |
     Raises:
         FileFormatError: As ``read_urdf``.
     """
-    return chain_of(root_of(read_urdf_text(source), str(source)), str(source), base_link, tip_link)
+    return parse_chain(read_urdf_text(source), str(source), base_link, tip_link)
+
+
+def parse_chain(text: str, source: str, base_link: str | None = None, tip_link: str | None = None) -> UrdfChain:
+    """Like ``read_chain``, from the text itself; ``source`` names it in errors.
+
+    Raises:
+        FileFormatError: As ``parse_urdf``.
+    """
+    return chain_of(root_of(text, source), source, base_link, tip_link)
 
 
 def _robot(root: ElementTree.Element, source: str, whole: UrdfChain) -> Robot:

@@ -1,4 +1,5 @@
-"""RViz markers of a plan: the robot at every configuration, the targets, their order and the path.
+"""RViz markers of a plan: the robot at every configuration, the targets, their order and the path. And of an
+estimate: the measured points, and how far each is from where it should be.
 
 The robot is drawn as a skeleton: base, origins of the joints, tip, and a line to each target. One marker holds
 all skeletons, so that a plan of any size is a handful of markers and one text per configuration. At most
@@ -19,6 +20,7 @@ from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.planning import Plan
 from calib_planner.robot import Robot, segments
 from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.residuals import PointResiduals
 
 MOST_SHOWN = 50
 """Configurations, and test poses, that are drawn at most."""
@@ -27,6 +29,13 @@ BONE, JOINT, TARGET, TEXT, PATH = 0.012, 0.03, 0.05, 0.08, 0.006
 FIRST, LAST = np.array([0.17, 0.45, 0.70, 0.9]), np.array([0.99, 0.68, 0.38, 0.9])
 """Colours from the first to the last configuration, red, green, blue, opacity."""
 TESTS = np.array([0.84, 0.15, 0.16, 1.0])
+USED, REJECTED = np.array([0.17, 0.63, 0.90, 1.0]), np.array([0.84, 0.15, 0.16, 1.0])
+"""Colours of measured points that the estimate uses, and of those that it does not."""
+MOST_POINTS = 2000
+"""Measured points that are drawn at most of those used, and of those not used."""
+LONGEST_USED, LONGEST, POINT = 0.1, 0.3, 0.012
+"""Length of the longest residual of the points used, of any residual, and size of a point, as a share of the
+extent [1]."""
 
 
 def plan_markers(plan: Plan, robot: Robot, stamp: int, frame_id: str) -> MarkerArray:
@@ -83,9 +92,52 @@ def skeletons(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     return lines.reshape(len(q), -1, 3), nodes, posture.targets
 
 
-def _shown(count: int) -> IntArray:
-    """Rows that are drawn: all, or MOST_SHOWN spread evenly with the first and the last."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_SHOWN)).round().astype(np.int64))
+def residual_markers(residuals: PointResiduals, stamp: int, frame_id: str) -> MarkerArray:
+    """The measured points, each with a line along its magnified residual; the first marker deletes those before.
+
+    A text says by how much residuals are magnified: 1, 2 or 5 times a power of ten. Lines of points that are not
+    used may be far longer, and are cut.
+
+    Args:
+        residuals: The points with their residuals.
+        stamp: Stamp of the headers [ns].
+        frame_id: The tracker's frame.
+    """
+    markers = [Marker(action=Marker.DELETEALL)]
+    points, vectors, used = residuals.points, residuals.vectors, residuals.used
+    if len(points):
+        extent = points[used] if used.any() else points
+        size = float(np.ptp(extent, axis=0).max()) or 1.0
+        lengths = np.linalg.norm(vectors, axis=1)
+        factor = magnification(float(lengths[used].max(initial=0.0)), LONGEST_USED * size)
+        cut = np.minimum(1.0, LONGEST * size / np.maximum(factor * lengths, np.finfo(float).tiny))
+        ends = points + factor * cut[:, None] * vectors
+        for name, colour, chosen in (("rejected", REJECTED, ~used), ("used", USED, used)):
+            rows = np.flatnonzero(chosen)
+            if len(rows):
+                shown = rows[_shown(len(rows), MOST_POINTS)]
+                colours, lines = np.tile(colour, (len(shown), 1)), np.stack([points[shown], ends[shown]], axis=1)
+                markers.append(_spheres(f"{name}_points", points[shown, None], colours, POINT * size))
+                markers.append(_lines(f"{name}_residuals", lines, colours, 0.4 * POINT * size))
+        top = extent.mean(axis=0) + size * np.array([0.0, 0.0, 0.6])
+        markers.append(_text(f"residuals x {factor:g}", 0, top.tolist(), TEXT * size))
+        markers[-1].ns = "magnification"
+    for marker in markers:
+        marker.header.stamp, marker.header.frame_id = stamp_message(stamp), frame_id
+    return MarkerArray(markers=markers)
+
+
+def magnification(length: float, wanted: float) -> float:
+    """1, 2 or 5 times a power of ten, the largest by which ``length`` stays within ``wanted``; 1 for length 0."""
+    if not length > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(wanted / length))
+    return float(max(f * power for f in (1.0, 2.0, 5.0) if f * power * length <= wanted * (1 + 1e-9)))
+
+
+def _shown(count: int, most: int = MOST_SHOWN) -> IntArray:
+    """Rows that are drawn: all, or ``most`` spread evenly with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def _shades(count: int) -> FloatArray:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from calib_planner.io import (
     URDF_SUFFIXES,
     Cell,
     StoredModel,
+    parse_chain,
     parse_speed_limits,
     parse_urdf,
     read_speed_limits,
@@ -52,6 +54,8 @@ MOST_MOVING = 64
 """Moving joints of the chain, at most."""
 LONGEST_NAME = 200
 DEFAULT_LEVEL = "lengths+offsets"
+DEFAULT_TIP = "tool0"
+"""Name of the tip's frame of robots that are not from a URDF, as in ROS-Industrial."""
 """What is identified while neither a parameter nor a plan says so."""
 
 
@@ -238,6 +242,15 @@ class IdentifiedModel:
         """The URDF that it was read from; empty if it was not read from one."""
         text = self.stored.source
         return text if text.lstrip().startswith("<") else ""
+
+    @cached_property
+    def ends(self) -> tuple[str, str]:
+        """Names of the frames of base and tip: links of the URDF, or as the parameters say."""
+        chosen = self.settings
+        if not self.urdf:
+            return chosen.frame_id, chosen.tip_frame or DEFAULT_TIP
+        chain = parse_chain(self.urdf, TOPIC, chosen.base_link or None, chosen.tip_link or None)
+        return chain.base, chosen.tip_frame or chain.tip
 
     def follow(self, plan: Plan) -> Robot:
         """The robot with the free parameters of a plan, unless the node's own say otherwise.

@@ -24,7 +24,7 @@ from calib_planner.ros.execution import Watch
 from calib_planner.ros.lifecycle import LifecycleParameters
 from calib_planner.ros.parameters import at_configure, constraints_text, described, parameter
 from calib_planner.simulation import ANGLE_ERROR, LENGTH_ERROR, Faults
-from calib_planner.units import cut
+from calib_planner.units import cut, listed
 
 LEVEL = "error parameters: a level (offsets, lengths, lengths+offsets, full) or names with commas between"
 UNKNOWN = "what else is unknown: base, tool or base,tool"
@@ -137,6 +137,15 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
     joint_topics: tuple[str, ...] = at_configure(
         ("joint_states",), "topics of the joint states: one, or several with some of the joints each"
     )
+    publish_transforms: bool = at_configure(
+        True, "publish base to tracker and tip to targets on /tf_static, if tf2_msgs is installed"
+    )
+    tip_frame: str = at_configure(
+        "", "name of the tip's frame on /tf_static; empty = the last link of robot_description, else tool0"
+    )
+    target_frames: tuple[str, ...] = at_configure(
+        ("",), "names of the targets' frames on /tf_static; empty = target_1, target_2, …"
+    )
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
     tracker_type: str = at_configure(
         "", "type of the messages on tracker_topics; empty = that of their publishers", choices=("", *POINTS)
@@ -180,7 +189,20 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
         super().__post_init__()
         if not self.tracker_topics or not all(self.tracker_topics):
             raise InputError("tracker_topics", self.tracker_topics, "one topic name per target")
-        _ = self.topics
+        _ = self.topics, self.target_names
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """Names of the targets' frames, one per target."""
+        count = len(self.tracker_topics)
+        names = tuple(filter(None, self.target_frames)) or tuple(f"target_{k + 1}" for k in range(count))
+        if len(names) != count or len(set(names)) != count:
+            raise InputError("target_frames", listed(names), f"{count} names, one per target, or none")
+        twice = set(names) & set(self.tracker_child_frames)
+        if twice and self.publish_transforms:
+            advice = "name them otherwise: a frame has one parent"
+            raise InputError("target_frames", listed(sorted(twice)), "others than tracker_child_frames", advice)
+        return names
 
     @property
     def topics(self) -> BagTopics:

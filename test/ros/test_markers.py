@@ -11,11 +11,22 @@ from robots import mixed, plan_of, random_configurations
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_planner import Robot
+from calib_planner.acquisition import Standstill
 from calib_planner.errors import InputError
-from calib_planner.io import config_folder
+from calib_planner.identification import IdentificationProblem, identify
+from calib_planner.io import ACCEPTED, Record, config_folder
+from calib_planner.measurements import Measurements
 from calib_planner.planning import Plan
-from calib_planner.ros.markers import MOST_SHOWN, plan_markers, skeletons
+from calib_planner.ros.markers import (
+    MOST_POINTS,
+    MOST_SHOWN,
+    magnification,
+    plan_markers,
+    residual_markers,
+    skeletons,
+)
 from calib_planner.ros.messages import pace_of, trajectory_message
+from calib_planner.ros.residuals import PointResiduals, residuals_message, residuals_of
 from calib_planner.ros.settings import PlannerParameters
 
 STAMP = 1_500_000_000
@@ -93,12 +104,92 @@ def test_one_configuration_has_no_path(robot: Robot) -> None:
 
 def test_rviz_shows_what_the_node_publishes() -> None:
     config = yaml.safe_load((config_folder() / "rviz" / "planner.rviz").read_text())["Visualization Manager"]
-    (display,) = [d for d in config["Displays"] if d["Class"] == "rviz_default_plugins/MarkerArray"]
-    topic = display["Topic"]
-    assert topic["Value"] == "/calibration_planner/markers" and display["Enabled"]
-    # A volatile reader would not get the latched markers of a plan made before RViz was started.
-    assert (topic["Durability Policy"], topic["Reliability Policy"]) == ("Transient Local", "Reliable")
+    displays = [d for d in config["Displays"] if d["Class"] == "rviz_default_plugins/MarkerArray"]
+    topics = [d["Topic"] for d in displays if d["Enabled"]]
+    assert [t["Value"] for t in topics] == ["/calibration_planner/markers", "/calibration_identifier/markers"]
+    for topic in topics:
+        # A volatile reader would not get the latched markers of a plan made before RViz was started.
+        assert (topic["Durability Policy"], topic["Reliability Policy"]) == ("Transient Local", "Reliable")
     assert config["Global Options"]["Fixed Frame"] == PlannerParameters().frame_id
+
+
+# ── residuals ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def some_residuals(count: int, used: int, length: float = 1e-5) -> PointResiduals:
+    """In a box of 2 m, residuals of up to ``length`` [m]; those beyond ``used`` are not used and far longer."""
+    rng = np.random.default_rng(3)
+    points, vectors = rng.uniform(-1.0, 1.0, (count, 3)), rng.uniform(-1.0, 1.0, (count, 3))
+    vectors *= length / np.linalg.norm(vectors[:used], axis=1).max()
+    vectors[used:] *= 1e4
+    numbers = np.arange(count)
+    return PointResiduals(numbers + 1, numbers * 0, points, vectors, numbers < used)
+
+
+def test_residuals_are_magnified_as_the_text_says_and_outliers_are_cut_and_red() -> None:
+    residuals = some_residuals(30, 27)
+    message = residual_markers(residuals, STAMP, "laser")
+    found = by_name(message)
+    np.testing.assert_allclose(rows(found["used_points"]), residuals.points[:27])
+    np.testing.assert_allclose(rows(found["rejected_points"]), residuals.points[27:])
+    word, factor = found["magnification"].text.rsplit(" ", 1)
+    assert word == "residuals x" and float(factor) == 1e4  # the longest is 0.01 mm, a tenth of 2 m is 0.2 m
+    lines = rows(found["used_residuals"]).reshape(-1, 2, 3)
+    np.testing.assert_allclose(lines[:, 0], residuals.points[:27])
+    np.testing.assert_allclose(lines[:, 1] - lines[:, 0], 1e4 * residuals.vectors[:27], atol=1e-12)
+    cut = np.linalg.norm(np.diff(rows(found["rejected_residuals"]).reshape(-1, 2, 3), axis=1), axis=2)
+    assert (cut < 0.61).all() and (cut > 0.5).all()  # 0.3 of 2 m
+    red, blue = found["rejected_points"].color, found["used_points"].color
+    assert red.r > red.b and blue.b > blue.r
+    assert {m.header.frame_id for m in message.markers} == {"laser"}
+    assert message.markers[0].action == Marker.DELETEALL
+    assert all(m.scale.x > 0 or m.scale.z > 0 for m in message.markers[1:])
+
+
+@pytest.mark.parametrize(
+    ("length", "factor"), [(0.1, 2.0), (0.03, 5.0), (0.02, 10.0), (3e-7, 5e5), (5.0, 0.02), (0.0, 1.0)]
+)
+def test_magnification_is_a_round_number(length: float, factor: float) -> None:
+    assert magnification(length, 0.2) == pytest.approx(factor)
+
+
+def test_without_an_estimate_the_markers_are_deleted() -> None:
+    (only,) = residual_markers(residuals_of(None, []), STAMP, "laser").markers
+    assert only.action == Marker.DELETEALL
+
+
+def test_thousands_of_residuals_are_a_bounded_picture() -> None:
+    found = by_name(residual_markers(some_residuals(9000, 6000), STAMP, "laser"))
+    assert len(found["used_points"].points) == len(found["rejected_points"].points) == MOST_POINTS
+
+
+def test_points_and_residuals_of_an_estimate_belong_together() -> None:
+    """Two targets, one of them not seen at one standstill, and a point that is not used."""
+    nominal = mixed().with_parameters("offsets")
+    q = random_configurations(nominal, 24, 5)
+    points = nominal.positions(q) + 2e-5 * np.random.default_rng(1).standard_normal((24, 2, 3))
+    points[3, 1], points[5, 0, 2] = np.nan, points[5, 0, 2] + 0.02
+    estimate = identify(IdentificationProblem(nominal, Measurements(nominal.joint_names, q, points)))
+    records = [Record(standing(q[k], points[k]), ACCEPTED, "", k, 0, number=10 + k) for k in range(24)]
+    found = residuals_of(estimate, records)
+    assert len(found.ids) == 47 and (found.ids[:3].tolist(), found.targets[:3].tolist()) == (
+        [10, 10, 11],
+        [0, 1, 0],
+    )
+    assert (13, 1) not in zip(found.ids.tolist(), found.targets.tolist(), strict=True)
+    (odd,) = np.flatnonzero(~found.used)
+    assert (found.ids[odd], found.targets[odd]) == (15, 0) and found.vectors[odd, 2] == pytest.approx(
+        0.02, abs=1e-3
+    )
+    np.testing.assert_array_equal(found.points[odd], points[5, 0])
+    message = residuals_message(found, "p", STAMP, "laser")
+    assert (list(message.ids), list(message.used)) == (found.ids.tolist(), found.used.tolist())
+    assert message.residuals[odd].z == found.vectors[odd, 2] and message.header.frame_id == "laser"
+
+
+def standing(q: np.ndarray, points: np.ndarray) -> Standstill:
+    seen = np.isfinite(points).all(axis=1)
+    return Standstill(1, 2, q, points, np.where(seen, 2e-5, np.nan), seen.astype(np.int64))
 
 
 # ── trajectory ───────────────────────────────────────────────────────────────────────────────────────

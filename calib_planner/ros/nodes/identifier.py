@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
-from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement, Residuals
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import UndoMeasurement
 from diagnostic_msgs.msg import DiagnosticArray
@@ -22,6 +22,7 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
 
 from calib_planner import __version__
 from calib_planner.acquisition import Intake, PointLike, Rejection, Standstill
@@ -40,6 +41,7 @@ from calib_planner.ros import session as saving
 from calib_planner.ros.cell import error_model_of
 from calib_planner.ros.diagnostics import diagnostics, health
 from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.markers import residual_markers
 from calib_planner.ros.messages import (
     ESTIMATE_NUMBERS,
     ESTIMATE_STATUS,
@@ -54,9 +56,11 @@ from calib_planner.ros.messages import (
 from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
+from calib_planner.ros.residuals import residuals_message, residuals_of
 from calib_planner.ros.session import Matching, Session, TooFew, condition_of
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.ros.streams import DriverStreams, Listener
+from calib_planner.ros.transforms import StaticFrames, placed_frames
 from calib_planner.units import brief, cut
 
 
@@ -68,6 +72,9 @@ class IdentifierOutput:
         self._estimates = node.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
         self._descriptions = node.create_publisher(String, "~/robot_description", LATCHED)
         self._measurements = node.create_publisher(Measurement, "~/measurements", EVENTS)
+        self._residuals = node.create_publisher(Residuals, "~/residuals", LATCHED)
+        self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED)
+        self._frames = StaticFrames(node) if node.settings.value.publish_transforms else None
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
 
     def record(self, session: Session, record: Record) -> None:
@@ -113,8 +120,18 @@ class IdentifierOutput:
             message.header.frame_id = frame_id
             if not estimate.missing:
                 self._log().error(estimate.message)
-        message.header.stamp = stamp_message(fitted[-1].acquired.end if fitted else 0)
+        message.header.stamp = stamp_message(stamp_of(session))
         self._estimates.publish(message)
+
+    def show(self, model: IdentifiedModel, session: Session, estimate: Estimate | TooFew) -> None:
+        """What an estimate means for each point, and where it puts tracker and targets."""
+        stamp, tracker = stamp_of(session), session.frame or "tracker"
+        residuals = residuals_of(estimate, session.of(FIT))
+        self._residuals.publish(residuals_message(residuals, session.plan_id, stamp, tracker))
+        self._markers.publish(residual_markers(residuals, stamp, tracker))
+        if self._frames is not None:
+            names = (*model.ends, tracker, model.settings.target_names)
+            self._frames.publish(placed_frames(estimate, *names) if isinstance(estimate, Estimate) else [], stamp)
 
     def description(self, urdf: str, estimate: Estimate | TooFew) -> None:
         """The calibrated URDF, or the nominal one ``urdf`` while there is no estimate; nothing without a URDF."""
@@ -122,6 +139,12 @@ class IdentifierOutput:
             urdf = calibrated_urdf(urdf, estimate.calibrated, TOPIC)[0]
         if urdf:
             self._descriptions.publish(String(data=urdf))
+
+
+def stamp_of(session: Session) -> int:
+    """Stamp of the newest measurement that is fitted [ns]; 0 if there is none."""
+    fitted = session.of(FIT)
+    return fitted[-1].acquired.end if fitted else 0
 
 
 class IdentifierNode(ManagedNode[IdentifierParameters]):
@@ -362,7 +385,9 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self._output.estimate(session, estimate, self.settings.value.frame_id)
         for record in changed:
             self._output.record(session, record)
-        self._output.description("" if self._model is None else self._model.urdf, estimate)
+        if self._model is not None:
+            self._output.description(self._model.urdf, estimate)
+            self._output.show(self._model, session, estimate)
 
     def _tick(self) -> None:
         """Publish diagnostics; look whether a store that could not be opened can be opened now."""
