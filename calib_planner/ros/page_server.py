@@ -195,15 +195,12 @@ class Sections:
         self.newest = 0
         self._texts: dict[str, tuple[int, str]] = {}
 
-    def take(self, values: Iterable[tuple[str, Any]]) -> bool:
-        """Take sections; whether any of them is new."""
-        before = self.newest
-        for name, value in values:
-            text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-            if self._texts.get(name, (0, ""))[1] != text:
-                self.newest += 1
-                self._texts[name] = (self.newest, text)
-        return self.newest > before
+    def take(self, name: str, value: Any) -> None:
+        """Take a section."""
+        text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+        if self._texts.get(name, (0, ""))[1] != text:
+            self.newest += 1
+            self._texts[name] = (self.newest, text)
 
     def since(self, number: int) -> str:
         """A JSON object of all sections that are newer than ``number``."""
@@ -216,7 +213,8 @@ class PageServer(Generic[T]):
     Args:
         page: The page.
         access: Who may come.
-        changed: Sections that differ between two states (the first may be ``None``), as plain values.
+        changed: Names of sections that differ between two states (the first may be ``None``), each with what
+            makes its plain values.
         press: Called in the server's thread when a button is pressed.
         reports: Folder of the reports; ``None`` if none are shown.
         say: Called in the server's thread with a line for the log.
@@ -226,7 +224,7 @@ class PageServer(Generic[T]):
         self,
         page: str,
         access: Access,
-        changed: Callable[[T | None, T], Iterable[tuple[str, Any]]],
+        changed: Callable[[T | None, T], Iterable[tuple[str, Callable[[], Any]]]],
         press: Press,
         reports: Path | None = None,
         say: Callable[[str], None] = print,
@@ -331,13 +329,14 @@ class PageServer(Generic[T]):
         state = self._next
         if state is None or state is self._shown:
             return
-        try:
-            new = self._sections.take(self._changed(self._shown, state))
-        except Exception as error:  # a fault of ours must not end the page
-            self._say(f"not shown: {error!r}")
-            new = False
+        before = self._sections.newest
+        for name, make in self._changed(self._shown, state):
+            try:
+                self._sections.take(name, make())
+            except Exception as error:  # a fault of ours in one of them must not end the page
+                self._say(f"{name} is not shown: {error!r}")
         self._shown = state
-        if new:
+        if self._sections.newest > before:
             self._loop.create_task(self._wake())
 
     async def _wake(self) -> None:

@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -678,14 +679,14 @@ FATES = {
 }
 
 
+@lru_cache(maxsize=4)  # the robot that moves is drawn ten times a second
 def placed(robot: Robot, estimate: Estimated | None, targets: int) -> Robot:
     """The robot where the estimate puts it in the frame of the points, with as many targets as are measured."""
     if targets != len(robot.targets):
         robot = robot.with_targets(np.zeros((targets, 3)))
-    if estimate is None:
-        return robot
-    known = {n: d for n, d in estimate.deviations.items() if n in robot.available_parameters}
-    return robot.with_parameters(tuple(known)).with_deviations(known)
+    given = {} if estimate is None else estimate.deviations
+    known = {n: d for n, d in given.items() if n in robot.available_parameters}
+    return robot.with_parameters(tuple(known)).with_deviations(known) if known else robot
 
 
 def _placed(state: PageState) -> Robot | None:
@@ -833,11 +834,15 @@ SECTIONS: dict[str, tuple[Callable[[PageState], Any], tuple[str, ...]]] = {
 """Part of the page → how it is made, and the fields of the state that it follows from."""
 
 
-def changed(before: PageState | None, after: PageState) -> Iterator[tuple[str, Any]]:
-    """(section, plain values) of what has to be made again; all of it without a state before."""
+def changed(before: PageState | None, after: PageState) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """(section, what makes its plain values) of what is not as before; all of it without a state before."""
     for name, (make, names) in SECTIONS.items():
         if before is None or any(getattr(before, n) is not getattr(after, n) for n in names):
-            yield name, plain(make(after))
+            yield name, partial(_plain, make, after)
+
+
+def _plain(make: Callable[[PageState], Any], state: PageState) -> Any:
+    return plain(make(state))
 
 
 def page_text() -> str:
