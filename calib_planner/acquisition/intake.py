@@ -247,6 +247,13 @@ class Intake:
         if self.detector is not None:
             self.detector.set_lost(target, not locked)
 
+    def rest(self, stream: int) -> float | None:
+        """How long what a stream shows has stood still [s], of joints all of them; ``None`` without a robot."""
+        if self.detector is None:
+            return None
+        of_joints = stream < self.joint_topics
+        return self.detector.joints_rest() if of_joints else self.detector.points_rest(stream - self.joint_topics)
+
     def dropped(self, stream: int) -> int:
         """Finite messages of a stream that came too late, twice or with a clock set back."""
         if self.detector is None:

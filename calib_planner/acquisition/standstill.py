@@ -280,6 +280,18 @@ class StandstillDetector:
         """Rests of the joints [ns] with a target's stamps more than ``bound`` [s] off, see ``ClockOffsets``."""
         return [rest for k in range(self.target_count) for rest in self.clocks.beyond(k, bound)]
 
+    def joints_rest(self) -> float:
+        """How long all joints have stood still, by their stamps [s]; about 0 while one of them moves."""
+        joints = self._joints
+        if self._measured is not None:
+            return max((joints.until or 0) - self._measured_since, 0) / NANO
+        return max(joints.last - joints.since, 0) / NANO if joints.at_rest else 0.0
+
+    def points_rest(self, target: int) -> float:
+        """How long a target, from 0, has stood still, by the stamps of its points [s]; about 0 while it moves."""
+        window = self._targets[target]
+        return (window.last - window.since) / NANO
+
     def joints_dropped(self, columns: Iterable[int]) -> int:
         """Finite states that took no part: too late, twice or set back; of that of these joints with most."""
         streams = {p.columns[0] for p in self._joints.parts if {*columns} & {*p.columns}}

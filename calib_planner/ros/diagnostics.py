@@ -38,6 +38,7 @@ class StreamHealth:
         messages: Since the node became active.
         refused, late, lost: Without stamp or joints; too late, twice or set back; not delivered.
         reason: Why the last message was refused; empty once one was usable again.
+        rest: How long what it shows has stood still [s]; about 0 while it moves, ``None`` without a robot.
         offset: Of the clocks, by standstills; ``None`` for the joints or as long as too little was seen.
     """
 
@@ -50,6 +51,7 @@ class StreamHealth:
     late: int
     lost: int
     reason: str
+    rest: float | None = None
     offset: Offset | None = None
 
 
@@ -68,6 +70,7 @@ def health(intake: Intake, now: int, seconds: float) -> list[StreamHealth]:
             late=intake.dropped(k),
             lost=count.lost,
             reason=count.reason,
+            rest=intake.rest(k),
             offset=None if detector is None or k < first else detector.clocks.offset(k - first),
         )
         for k, count in enumerate(intake.streams)
@@ -119,6 +122,7 @@ def _stream(s: StreamHealth, bound: float) -> Finding:
         "skew to the joints [s]": "" if s.skew is None else f"{s.skew:.3f}",
         "clock offset [s]": "" if s.offset is None else f"{s.offset.seconds:+.3f}",
         "clock offset, doubt [s]": "" if s.offset is None else f"{s.offset.doubt:.3f}",
+        "standing still [s]": "" if s.rest is None else f"{s.rest:.1f}",
         "messages": s.messages,
         "refused": s.refused,
         "too late or twice": s.late,

@@ -48,6 +48,8 @@ MOST_ROWS = 100
 MOST_LINES, MOST_REASONS, MOST_STREAMS, MOST_HISTORY = 30, 30, 20, 500
 LONGEST = 600
 """Characters of a text from a topic."""
+LEAST_REST = 0.2
+"""A shorter rest is taken for motion [s]: two samples at a turning point are one."""
 UNKNOWN = "–"
 """Shown where a number is not known."""
 
@@ -350,9 +352,14 @@ def _joints(where: str, message: Any, names: Sequence[str], *, empty: bool = Fal
     raise InputError(where, f"{len(q)} joints", f"{len(names)} finite numbers, one per joint name")
 
 
+def _sentence(text: str) -> str:
+    """With a capital letter."""
+    return text[:1].upper() + text[1:]
+
+
 def _reasons(verdict: Verdict) -> tuple[Why, ...]:
     return tuple(
-        Why(LEVELS.get(f.level, ""), cut(f.text, LONGEST), cut(f.advice, LONGEST))
+        Why(LEVELS.get(f.level, ""), _sentence(cut(f.text, LONGEST)), _sentence(cut(f.advice, LONGEST)))
         for f in verdict.reasons[:MOST_REASONS]
     )
 
@@ -546,8 +553,7 @@ def _now(state: PageState) -> dict[str, Any]:
         text = f"{done} measured" if ended else f"visit {min(done + 1, total)} of about {total}"
         text = f"about {total} visits" if campaign.state == S.PAUSED and not done else text
         count = {"done": done, "total": done if ended else total, "count": text}
-    reason = SERVICE.sub(_pressed, campaign.reason)
-    reason = reason[:1].upper() + reason[1:]
+    reason = _sentence(SERVICE.sub(_pressed, campaign.reason))
     return {"kind": kind, "word": word, "title": title, "reason": reason, **count}
 
 
@@ -753,23 +759,25 @@ def _here(state: PageState) -> list[Any] | None:
 
 
 def _streams(state: PageState) -> list[dict[str, str]]:
-    """Each stream: is it there, how old, and does it stand still."""
+    """Each stream: is it there, and does what it shows stand still."""
     return [
         {
             "name": s.name,
             "level": s.level,
             "text": s.text,
-            "rate": _value(s, "rate [Hz]", "Hz"),
-            "age": _value(s, "age [s]", "s"),
-            "motion": s.values.get("motion", ""),
+            "motion": _motion(s),
         }
         for s in state.streams
     ]
 
 
-def _value(stream: Stream, key: str, unit: str) -> str:
-    value = stream.values.get(key, "")
-    return f"{value} {unit}" if value else ""
+def _motion(stream: Stream) -> str:
+    """Whether what a stream shows stands still, as the identifier says on /diagnostics; empty if it does not."""
+    try:
+        rest = float(stream.values.get("standing still [s]", ""))
+    except ValueError:
+        return ""
+    return f"stands still, {rest:.1f} s" if rest >= LEAST_REST else "moves"
 
 
 def _verdict(state: PageState) -> dict[str, Any] | None:

@@ -288,3 +288,18 @@ def test_wrong_shapes_are_refused() -> None:
         detector.add_point(0, 0, [1.0, 2.0])
     with pytest.raises(InputError, match="target"):
         detector.add_point(1, 0, [0.0, 0.0, 0.0])
+
+
+def test_it_tells_how_long_joints_and_points_have_stood_still() -> None:
+    detector = StandstillDetector(2, 1)
+    assert detector.joints_rest() == detector.points_rest(0) == 0.0
+    for k in range(400):  # 2 s at rest, of which a result needs less
+        detector.add_joints(k * 5_000_000, [0.0, 1.0])
+        detector.add_point(0, k * 5_000_000, [1.0, 2.0, 3.0])
+    assert detector.joints_rest() == pytest.approx(2.0, abs=0.2)
+    assert detector.points_rest(0) == pytest.approx(2.0, abs=0.2)
+    for k in range(400, 500):
+        detector.add_joints(k * 5_000_000, [0.0, 1.0 + 0.01 * (k - 399)])
+        detector.add_point(0, k * 5_000_000, [1.0, 2.0, 3.0 + 0.01 * (k - 399)])
+        if k > 450:
+            assert detector.joints_rest() < 0.02 and detector.points_rest(0) < 0.02

@@ -144,17 +144,17 @@ class Script:
 
     def diagnostics(self) -> DiagnosticArray:
         rows = (
-            ("joint_states", b"\0", "100 Hz", "stands still, 1.4 s"),
-            ("tracker/point", b"\1", "no point for 3 s", "moves"),
+            ("joint_states", b"\0", "100 Hz", "1.4"),
+            ("tracker/point", b"\1", "no point for 3 s", "0.0"),
         )
         status = [
             DiagnosticStatus(
                 name=f"calibration_identifier: stream {name}",
                 level=level,
                 message=text,
-                values=[KeyValue(key="rate [Hz]", value="100.0"), KeyValue(key="motion", value=motion)],
+                values=[KeyValue(key="rate [Hz]", value="100.0"), KeyValue(key="standing still [s]", value=rest)],
             )
-            for name, level, text, motion in rows
+            for name, level, text, rest in rows
         ]
         return DiagnosticArray(status=status)
 

@@ -239,7 +239,7 @@ function sceneView(scene) {
 
   function caption(pen, height) {
     const which = good.filter(Boolean).length > MOST_ARROWS ? `, the ${MOST_ARROWS} largest` : "";
-    const vectors = count ? ` · error vectors × ${state.factor}, ${state.when} calibration${which}` : "";
+    const vectors = errors[state.when].some((e) => e > 0) ? ` · error vectors × ${state.factor}, ${state.when} calibration${which}` : "";
     text(pen, `grid ${step} m${vectors}`, 8, height - 9, SOFT);
   }
 
