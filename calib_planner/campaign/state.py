@@ -252,6 +252,21 @@ class CampaignState:
             return replace(self, measurements=tuple(row if r.number == number else r for r in self.measurements))
         return replace(self, measurements=(*self.measurements, row), queue=_without_first(self.queue, index))
 
+    def adopted(
+        self, role: str, q: ArrayLike, points: ArrayLike, number: int, std: ArrayLike | None = None
+    ) -> CampaignState:
+        """A measurement of this campaign that was not heard of when it was made, at a configuration of its own.
+
+        Args:
+            role: What it was measured for.
+            q, points, number, std: See ``measured``.
+
+        Raises:
+            InputError: As ``measured``.
+        """
+        more = (*self.configurations, PlannedConfiguration(np.asarray(q, float), role))
+        return replace(self, configurations=more).measured(len(more) - 1, q, points, number, std)
+
     def withdrawn(self, number: int, reason: str) -> CampaignState:
         """A measurement no longer counts (an outlier, undone): it is visited again if attempts are left."""
         gone = next((r for r in self.measurements if r.number == number), None)

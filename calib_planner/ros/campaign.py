@@ -44,6 +44,7 @@ from calib_planner.ros.executor import Ended, PlanExecution
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import (
     NAN,
+    PURPOSE,
     duration_message,
     estimate_to_message,
     in_ros,
@@ -200,6 +201,7 @@ ANYWHERE = (
     Measurement.REJECTED_NOT_STORED,
 )
 """Rejections that another configuration would meet as well."""
+ROLE = {value: role for role, value in PURPOSE.items()}
 HALTED = {"stopped": "the robot was stopped", "beam_lost": "the beam was lost"}
 """Ends of a goal after which a person has to look: what is said of each."""
 
@@ -215,6 +217,7 @@ class Visit:
         reason: Why the identifier rejected a standstill meanwhile; empty if it rejected none.
         anywhere: Whether it was for one of ``ANYWHERE``.
         final: Whether the identifier will not judge this standstill again.
+        asked: Whether the identifier, which said nothing, was asked again.
     """
 
     action: Measure
@@ -223,6 +226,7 @@ class Visit:
     reason: str = ""
     anywhere: bool = False
     final: bool = False
+    asked: bool = False
 
     def next(self, phase: str, now: float) -> None:
         """Begin a phase at ``now`` [s]."""
@@ -288,7 +292,8 @@ class Measuring:
         """Take what the identifier publishes about a standstill.
 
         An outlier counts as measured: the campaign looks for outliers itself, and its fit must not depend on what
-        is measured for validation.
+        is measured for validation. A measurement of this campaign that belongs to no plan known here is one that
+        was made just before a crash: it counts, too.
 
         Raises:
             InputError: A measurement of other joints.
@@ -300,12 +305,17 @@ class Measuring:
             self._rejected(message)
             return state
         self._spoilt = ""
-        plan = self._plans.get(message.plan_id)
-        if known or plan is None or message.configuration_index >= len(plan.numbers):
+        if known:
             return state
+        plan = self._plans.get(message.plan_id)
         points, std = (np.array([[v.x, v.y, v.z] for v in many]) for many in (message.points, message.std))
-        number, q = plan.numbers[message.configuration_index], _joints(message, state)
-        return state.measured(number, q, points, int(message.id), std if std.shape == points.shape else None)
+        what = points, int(message.id), std if std.shape == points.shape else None
+        if plan is not None and message.configuration_index < len(plan.numbers):
+            number = plan.numbers[message.configuration_index]
+            return state.measured(number, _joints(message, state), *what)
+        if self._id and message.campaign_id == self._id and message.purpose in ROLE:
+            return state.adopted(ROLE[message.purpose], _joints(message, state), *what)
+        return state
 
     def _rejected(self, message: Measurement) -> None:
         visit = self.visit
@@ -399,6 +409,13 @@ class Measuring:
         if not visit.reason and not self._node.count_publishers(f"{name}/measurements"):
             self._wait_for(f"{name} is not there")
             visit.next("telling", self._node.seconds)
+            return state
+        if not visit.reason and not visit.asked and self._plan is not None:
+            # It may have accepted it and was started anew since: a plan that is told again is answered with
+            # what was measured.
+            visit.asked = True
+            self._announce(self._plan)
+            visit.next("judging", self._node.seconds - max(self._settings.patience - RETRY, 0.0))
             return state
         if visit.anywhere:
             self.visit, self._spoilt = None, visit.reason

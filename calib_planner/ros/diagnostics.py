@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from calib_planner.acquisition import NANO, Intake, Offset
+from calib_planner.campaign import VALIDATION
 from calib_planner.identification import Estimate
 from calib_planner.io import UnavailableStore
 from calib_planner.ros.messages import stamp_message
@@ -142,9 +143,11 @@ def _stream(s: StreamHealth, bound: float) -> Finding:
 def _campaign(session: Session) -> Finding:
     rejections, missing = session.rejections, session.missing()
     values: dict[str, object] = {
+        "campaign": session.campaign_id,
         "plan": session.plan_id,
         "planned measurements": 0 if session.plan is None else session.plan.measurements,
         "accepted": len(session.accepted),
+        "of them held out for validation": sum(r.role == VALIDATION for r in session.accepted),
         "rejected": sum(rejections.values()),
         **{f"rejected: {status}": count for status, count in sorted(rejections.items())},
         "configurations missing": len(missing),

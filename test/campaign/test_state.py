@@ -85,6 +85,28 @@ def test_a_stop_measured_once_and_then_unreachable_leaves_no_neighbourhood(plann
     assert not state.exclusions and state.dropped == (twice,) and twice not in state.queue
 
 
+def test_what_is_ahead_can_be_planned_anew_around_a_configuration(planned):
+    """The visit under way stays; a campaign that is paused has none under way."""
+    paused = planned.pause()
+    assert planned.ahead == planned.queue[1:] and paused.ahead == paused.queue
+    under_way, other = planned.queue[0], next(i for i in planned.queue if i != planned.queue[0])
+    kept = planned.skipped(other, replan=True)
+    assert kept.queue == ((under_way,) if under_way in planned.skipped(other).queue else ()) and not kept.ahead
+    for state, index in ((planned, under_way), (paused, under_way), (paused, other)):
+        assert not state.skipped(index, replan=True).queue
+    again = paused.skipped(other, replan=True)
+    step = decide(again)
+    allowed = again.constraints[-1].allowed(PROBLEM.robot, np.array([c.q for c in step.configurations]))
+    assert step.queue and allowed.all() and again.decided(step).paused
+
+
+def test_a_measurement_that_was_not_heard_of_counts_where_it_was_made(planned):
+    q = PROBLEM.test_pose_array[0] + 0.1
+    state = planned.adopted("validation", q, POINTS, 9)
+    assert state.queue == planned.queue and [r.number for r in state.measurements_of("validation")] == [9]
+    assert state.spent("validation") == 1 and state.configurations[-1].q.tolist() == q.tolist()
+
+
 def test_pause_and_resume_change_nothing_else(planned):
     paused = planned.pause()
     assert isinstance(paused.action, Paused)

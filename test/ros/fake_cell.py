@@ -42,7 +42,8 @@ class FakeCell(Node):
     """``answer`` says what becomes of a configuration (joints,):
 
     ``ok``, ``refuse`` (INVALID_PLAN), a status by its name, ``nonsense`` (no status there is), ``reject``
-    (measured, not accepted), ``ignore`` (nothing is published), ``hang`` (no end, no feedback until cancelled).
+    (measured, not accepted), ``ignore`` (nothing is published), ``untold`` (measured, but published only when a
+    plan comes: the identifier was started anew), ``hang`` (no end, no feedback until cancelled).
     """
 
     THREADS = 3
@@ -54,6 +55,7 @@ class FakeCell(Node):
         self.answer: Answer = lambda q: "ok"
         self.takes_plans = True
         self.plans: list[PlanMessage] = []
+        self.untold: list[tuple[np.ndarray, dict[str, object]]] = []
         self.visited: list[np.ndarray] = []
         self.number = self.stopped = 0
         self.closing = threading.Event()
@@ -79,6 +81,9 @@ class FakeCell(Node):
         self.plans.append(message)
         if self.takes_plans:
             self._plan = message
+            for q, others in self.untold:
+                self.publish(q, **others)
+            self.untold.clear()
             self._estimates.publish(CalibrationEstimate(plan_id=message.plan_id))
 
     def _execute(self, goal: object) -> ExecutePlan.Result:
@@ -101,7 +106,9 @@ class FakeCell(Node):
             goal.abort()
             words = "x" * 10**6 if answer == "nonsense" else f"cannot go there: {answer}"
             return kind(status=STATUS[answer], message=words)
-        if answer != "ignore":
+        if answer == "untold":
+            self.untold.append((q, {}))
+        elif answer != "ignore":
             self.publish(q, accepted=answer == "ok")
         goal.succeed()
         return kind(status=kind.SUCCESS, executed=1)

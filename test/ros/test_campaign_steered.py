@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from bench import Bench
-from calib_planner_msgs.msg import CalibrationEstimate
+from calib_planner_msgs.msg import CalibrationEstimate, Measurement
+from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import SkipConfiguration
 from desk import ASKED, NAME, Desk, S
 from fake_cell import FakeCell
@@ -159,6 +160,34 @@ def test_a_robot_that_is_not_ready_is_waited_for(bench: Bench, cell: FakeCell) -
     assert desk.until(S.WAITING, said="cannot go there: not_ready").excluded == 0
     done = desk.until(S.DONE)
     assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
+
+
+def test_what_an_identifier_accepted_before_a_crash_is_not_measured_again(bench: Bench, cell: FakeCell) -> None:
+    """It tells it when the plan is told again; also what belongs to no plan of the campaign's memory."""
+    answers = {3: "untold"}
+    cell.answer = lambda q: answers.get(len(cell.visited), "ok")
+    desk = Desk(bench, attempts=1, patience=0.5)
+    assert desk.call("start")[0]
+    done = desk.until(S.DONE)
+    assert done.excluded == 0 and desk.node.campaign.spent() == done.measured + done.validated == len(
+        cell.visited
+    )
+    last = len(cell.visited) + 3
+    answers[last] = "hang"
+    assert desk.call("start")[0]
+    bench.wait(lambda: len(cell.visited) == last)
+    assert desk.now.campaign_id != done.campaign_id
+    unplanned = {"configuration_index": Measurement.UNPLANNED, "campaign_id": desk.now.campaign_id}
+    q = desk.node.campaign.problem.test_pose_array[0] + 0.3
+    cell.publish(q, **unplanned | {"campaign_id": done.campaign_id})
+    cell.publish(q, **unplanned)
+    cell.publish(q + 0.1, **unplanned, purpose=PlanMessage.VALIDATION)
+    bench.wait(lambda: (desk.now.measured, desk.now.validated) == (3, 1))
+    assert desk.call("pause")[0] and desk.call("resume")[0]
+    again = desk.until(S.DONE)
+    state = desk.node.campaign
+    assert [c.role for c in state.configurations if near(c.q, [q, q + 0.1])] == ["fit", "validation"]
+    assert len(state.measurements) == again.measured + again.validated and again.validated == 3
 
 
 # ── goals and counters ───────────────────────────────────────────────────────────────────────────────

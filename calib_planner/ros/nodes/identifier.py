@@ -79,6 +79,11 @@ class IdentifierOutput:
 
     def record(self, session: Session, record: Record) -> None:
         """What became of a standstill."""
+        self.tell(session, record)
+        self._log().info(f"configuration {record.index}: {record.status} {record.reason}".rstrip())
+
+    def tell(self, session: Session, record: Record) -> None:
+        """Publish what became of a standstill."""
         message = measurement_message(
             record.acquired,
             session.nominal.joint_names,
@@ -94,7 +99,6 @@ class IdentifierOutput:
             unused=record.unused,
         )
         self._measurements.publish(message)
-        self._log().info(f"configuration {record.index}: {record.status} {record.reason}".rstrip())
 
     def estimate(self, session: Session, estimate: Estimate | TooFew, frame_id: str) -> None:
         """The estimate, or why there is none; ``frame_id`` is the robot's base."""
@@ -286,6 +290,9 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
                 role=received.purpose,
                 keep=chosen.keep_measurements,
             )
+            if received.campaign_id and self._intake is not None:
+                for record in session.records:  # whoever tells the plan may have missed some of them
+                    self._output.tell(session, record)
             if not new:
                 return
         except CalibPlannerError as error:
