@@ -1,22 +1,25 @@
-"""Starts calibration_campaign, which measures with robot and identifier until the estimate is accurate enough.
+"""Starts all that a real cell needs for a campaign: planner, identifier, executor, campaign and page.
 
-    ros2 launch calib_planner campaign.launch.py parameters:=/path/to/my.yaml
-    ros2 service call /calibration_campaign/start std_srvs/srv/Trigger
+    ros2 launch calib_planner campaign.launch.py cell:=cell.yaml
+    ros2 launch calib_planner campaign.launch.py cell:=cell.yaml simulate:=true   # no robot, no tracker: to try it
+    ros2 launch calib_planner campaign.launch.py cell:=left.yaml namespace:=left  # one of two cells
+
+The file of the cell says which robot, tracker, controller and topics there are, where accuracy matters and how much
+of it, and where results are stored: docs/reference/cell.md. Parameters that it does not have can be given by
+params_file. The robot moves when the campaign is started, on the page, whose address is in the log, or by
+
+    ros2 service call /calibration_campaign/start std_srvs/srv/Trigger      # pause, resume, skip
     ros2 topic echo /calibration_campaign/status
-    ros2 service call /calibration_campaign/pause std_srvs/srv/Trigger      # resume, skip
+    ros2 service call /plan_executor/stop std_srvs/srv/Trigger              # no emergency stop
 
-The file has to give test_poses, required_accuracy and store_folder. All parameters with their units and ranges
-are in config/campaign.yaml. Arguments that are given win over files; those that are not leave what the files say.
-The identifier runs with keep_measurements: true and plan_topic: calibration_campaign/plan.
+Without control_msgs there is no executor, without the page's library no page: that is said at the start.
 """
 
 from launch import LaunchDescription
 
-from calib_planner.ros.launching import COMMON, describe
-
-KINDS = {**COMMON}
+from calib_planner.ros.launching import describe_campaign
 
 
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` runs."""
-    return describe("campaign", "calibration_campaign", KINDS)
+    return describe_campaign()

@@ -2,10 +2,10 @@
 
     ros2 launch calib_planner planner.launch.py
     ros2 launch calib_planner planner.launch.py robot:=ur10e rviz:=true
-    ros2 launch calib_planner planner.launch.py namespace:=cell_1 parameters:=/path/to/my.yaml
+    ros2 launch calib_planner planner.launch.py namespace:=cell_1 params_file:=/path/to/my.yaml
     ros2 launch calib_planner planner.launch.py autostart:=false    # a lifecycle manager drives it
 
-A URDF heard on robot_description (robot_state_publisher) replaces robot. The file given as ``parameters`` needs
+A URDF heard on robot_description (robot_state_publisher) replaces robot. The file given as ``params_file`` needs
 to hold only what differs from config/planner.yaml, where all parameters are with their units and ranges.
 Arguments that are given win over files; those that are not leave what the files say. Then:
 
@@ -15,11 +15,9 @@ Arguments that are given win over files; those that are not leave what the files
 
 from launch import LaunchDescription
 
-from calib_planner.ros.launching import COMMON, describe
-
-KINDS = {"robot": str, **COMMON}
+from calib_planner.ros.launching import describe
 
 
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` runs."""
-    return describe("planner", "calibration_planner", KINDS, rviz=True)
+    return describe("planner", rviz=True)

@@ -78,21 +78,37 @@ def planned_model_of(settings: PlannerParameters, wanted: str, robot: Robot, noi
 
 
 def node_parameters(path: str | Path, *, simulate: bool, executor: bool) -> dict[str, Parameters]:
-    """Part (``planner`` …) → the parameters that the nodes of a cell are started with.
+    """Part (``planner`` …) → the parameters that the nodes of a campaign are started with.
 
     Args:
-        path: The cell's file.
+        path: The cell's file; empty for a robot that is chosen otherwise.
         simulate: Whether ``tracker_simulator`` stands in for robot, controller and tracker.
-        executor: Whether ``plan_executor`` moves the robot; without it the simulator does.
+        executor: Whether there is a ``plan_executor``.
 
     Raises:
-        FileFormatError: The file, or one that it names, cannot be used.
-        InputError: What it says does not fit the robot.
+        FileFormatError: The file, or one that it names, cannot be used, or does not fit the robot.
     """
-    cell = read_cell(path)
-    robot = cell.load_robot()
-    noise = cell.load_noise()
-    cell.load_constraints(robot)
+    robot = "tracker_simulator" if simulate and not executor else "plan_executor"
+    parts: dict[str, Parameters] = {
+        "planner": {},
+        "identifier": {"plan_topic": "calibration_campaign/plan", "keep_measurements": True},
+        "campaign": {"execute_action": f"{robot}/execute_plan"},
+        "executor": {},
+        "page": {"executor": robot},
+        "simulator": {},
+    }
+    if not executor:
+        del parts["executor"]
+    if not simulate:
+        del parts["simulator"]
+    said = _said(read_cell(path), str(Path(path).resolve())) if path else {}
+    return {part: said.get(part, {}) | wiring for part, wiring in parts.items()}
+
+
+def _said(cell: Cell, path: str) -> dict[str, Parameters]:
+    """Part → what a cell says about its parameters."""
+    robot, noise = cell.load_robot(), cell.load_noise()
+    cell.load_constraints(robot)  # what cannot be used is better said before five nodes say it
     cell.load_error_model(robot)
     topics = cell.tracker_topics or tracker_topics(len(robot.targets))
     if len(topics) != len(robot.targets):
@@ -102,52 +118,44 @@ def node_parameters(path: str | Path, *, simulate: bool, executor: bool) -> dict
     if poses is None:
         expected = "test-pose or test-path: where accuracy matters"
         raise FileFormatError(cell.path, "test-pose", "no such key", expected)
-    chain = tuple(name for name in robot.parameter_names if role_of(name) not in (BASE, TARGET))
 
-    own: Parameters = {"cell": str(Path(path).resolve())}
-    wanted = {
-        "parameters": ",".join(cell.parameters or chain),
-        "unknown": ",".join(u for u in cell.unknown or () if u != EVERYTHING_KNOWN),
-    }
-    sigma = {} if noise is None else {"sigma": noise.typical}
-    frame = given(frame_id=cell.base_frame)
-    accuracy = given(accuracy_frame=cell.accuracy_frame)
-    store = given(store_folder=cell.store_folder)
-    pace = given(speed_share=cell.speed_share, settle=cell.settle, dwell=cell.dwell)
-    pace |= given(joint_speed=cell.speed, slide_speed=cell.speed)
-    locked, controller = given(locked_topics=cell.tracker_locked), given(controller_action=cell.controller)
-    parts: dict[str, Parameters] = {
-        "planner": own | wanted | sigma | frame | pace,
-        "identifier": own
-        | wanted
-        | sigma
-        | frame
-        | accuracy
-        | store
-        | given(
+    chain = tuple(name for name in robot.parameter_names if role_of(name) not in (BASE, TARGET))
+    own: Parameters = {"cell": path}
+    measured = own | _known(
+        parameters=",".join(cell.parameters or chain),
+        unknown=",".join(u for u in cell.unknown or () if u != EVERYTHING_KNOWN),
+        sigma=None if noise is None else noise.typical,
+        frame_id=cell.base_frame,
+    )
+    results = measured | _known(accuracy_frame=cell.accuracy_frame, store_folder=cell.store_folder)
+    pace = _known(
+        joint_speed=cell.speed,
+        slide_speed=cell.speed,
+        speed_share=cell.speed_share,
+        settle=cell.settle,
+        dwell=cell.dwell,
+    )
+    controlled = own | _known(locked_topics=cell.tracker_locked, controller_action=cell.controller)
+    return {
+        "planner": measured | pace | _known(accuracy_frame=cell.accuracy_frame),
+        "identifier": results
+        | _known(
             joint_topics=cell.joint_topics,
             tracker_topics=topics,
             tracker_child_frames=cell.tracker_frames,
             tracker_state_topics=cell.tracker_locked,
-        )
-        | {"plan_topic": "calibration_campaign/plan", "keep_measurements": True},
-        "campaign": own
-        | wanted
-        | sigma
-        | frame
-        | accuracy
-        | store
-        | given(budget=cell.budget, validation=cell.validation, required_accuracy=cell.required_accuracy)
-        | {
-            "test_poses": "; ".join(" ".join(f"{x:.12g}" for x in row) for row in poses),
-            "execute_action": f"{'plan_executor' if executor else 'tracker_simulator'}/execute_plan",
-        },
+        ),
+        "campaign": results
+        | _known(
+            test_poses="; ".join(" ".join(f"{x:.12g}" for x in row) for row in poses),
+            required_accuracy=cell.required_accuracy,
+            budget=cell.budget,
+            validation=cell.validation,
+        ),
+        "executor": controlled | pace | _known(moveit_group=cell.moveit_group),
+        "page": own | _known(joint_topics=cell.joint_topics, report_folder=cell.store_folder),
+        "simulator": controlled | _known(tracker_topics=topics, sigma=None if noise is None else noise.typical),
     }
-    if executor:
-        parts["executor"] = own | pace | locked | controller | given(moveit_group=cell.moveit_group)
-    if simulate:
-        parts["simulator"] = own | sigma | locked | controller | {"tracker_topics": topics}
-    return parts
 
 
 def tracker_topics(targets: int) -> tuple[str, ...]:
@@ -155,6 +163,6 @@ def tracker_topics(targets: int) -> tuple[str, ...]:
     return ("tracker/point",) if targets == 1 else tuple(f"tracker/point_{k + 1}" for k in range(targets))
 
 
-def given(**values: Any) -> Parameters:
-    """Those that are said."""
+def _known(**values: Any) -> Parameters:
+    """Those that the cell says."""
     return {name: value for name, value in values.items() if value is not None}

@@ -32,6 +32,7 @@ from std_srvs.srv import Trigger
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.io import shipped_robots, user_path
 from calib_planner.ros import page_state
+from calib_planner.ros.cell import cell_of
 from calib_planner.ros.lifecycle import ManagedNode, reason_of
 from calib_planner.ros.model import DEFAULT_LEVEL, TOPIC, described_model, load_shipped
 from calib_planner.ros.page_server import REPORT, Access, Answer, PageServer
@@ -89,7 +90,10 @@ class PageNode(ManagedNode[PageParameters]):
         self._calls: list[Pending] = []
         self._joints: dict[str, float] = {}
         self._heard = 0.0
-        if chosen.robot:
+        cell = cell_of(chosen)
+        if cell is not None:
+            self._state, self._described = replace(self._state, robot=cell.load_robot()), True
+        elif chosen.robot:
             self._state = replace(self._state, robot=load_shipped(chosen.robot, DEFAULT_LEVEL))
         self._callers = {name: self._client_of(name) for name in BUTTONS}
         self._listen(chosen)
@@ -112,7 +116,7 @@ class PageNode(ManagedNode[PageParameters]):
         follow(DiagnosticArray, "/diagnostics", page_state.on_diagnostics, EVENTS)
         feedback = f"{chosen.executor}/execute_plan/_action/feedback"
         self.create_subscription(ExecutePlan.Impl.FeedbackMessage, feedback, self._on_feedback, EVENTS)
-        if chosen.use_robot_description:
+        if chosen.use_robot_description and not chosen.cell:
             self.create_subscription(String, TOPIC, self._on_description, LATCHED)
         streams = [Stream(JointState, topic, self._on_joints, lambda _: None) for topic in chosen.joint_topics]
         StreamPoller(self, streams, NEWEST_IN, DRAWN)
