@@ -202,12 +202,12 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         if self._reader is None:
             return
         try:
-            joints = self._reader.read(message)
+            part, joints = self._reader.read(message)
         except CalibPlannerError as error:
             self.get_logger().warning(f"joint_states: {cut(error, 500)}", throttle_duration_sec=5.0)
             return
         stamp = nanoseconds(message.header.stamp)
-        if joints is not None and stamp > 0:
+        if part is None and stamp > 0:
             self._view = self._view.seen(stamp / NANO, joints)
 
     def _on_locked(self, index: int, message: Bool) -> None:
