@@ -21,12 +21,14 @@ from calib_planner.io import config_folder
 from calib_planner.ros import settings as parameter_yaml
 from calib_planner.ros.model import load_shipped
 from calib_planner.ros.nodes.campaign import CampaignNode
+from calib_planner.ros.nodes.executor import ExecutorNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.planner import PlannerNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import descriptor
 from calib_planner.ros.settings import (
     CampaignParameters,
+    ExecutorParameters,
     IdentifierParameters,
     PlannerParameters,
     SimulatorParameters,
@@ -37,6 +39,7 @@ NODES = [
     ("identifier", IdentifierParameters, IdentifierNode),
     ("simulator", SimulatorParameters, SimulatorNode),
     ("campaign", CampaignParameters, CampaignNode),
+    ("executor", ExecutorParameters, ExecutorNode),
 ]
 
 

@@ -209,6 +209,7 @@ def test_the_truth_is_nowhere_on_the_graph(bench: Bench) -> None:
         "/parameter_events",
         "/joint_states",
         "/tracker/point",
+        "/tracker/locked",
         "/tracker_simulator/transition_event",
     }
 
