@@ -36,6 +36,7 @@ from calib_planner.planning import Pace, Plan, Trajectory, joined, smooth_trajec
 from calib_planner.robot import Robot
 from calib_planner.units import counted, cut
 
+BEAM_ADVICE = "bring the beam back, then send the rest of the plan"
 REFUSED = "the controller refused the move"
 SET_BACK = 1.0
 """A clock that goes back by more than this was set, or a simulation began again [s]."""
@@ -377,11 +378,17 @@ class Outcome:
         status: Name of a status constant of ``ExecutePlan``'s result.
         message: For a person.
         alarm: Whether the robot was not seen to stand.
+        advice: What to do, at the end of the message once it has ended.
     """
 
     status: str
     message: str
     alarm: bool = False
+    advice: str = ""
+
+    def with_words(self, words: str, alarm: bool = False) -> Outcome:
+        """The same with more words before the advice."""
+        return Outcome(self.status, "; ".join(filter(None, (self.message, words, self.advice))), alarm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -526,16 +533,19 @@ def _to(state: Execution, phase: Phase, **changes: object) -> Execution:
     return replace(state, phase=phase, since=state.now, **changes)  # type: ignore[arg-type]
 
 
-def _end(state: Execution, status: str, message: str, place: bool = False) -> tuple[Execution, Actions]:
+def _end(
+    state: Execution, status: str, message: str, advice: str = "", *, place: bool = False
+) -> tuple[Execution, Actions]:
     """End early, for the first reason there is; ``place``: the message is about the configuration under way."""
     if state.ending is not None:
         return state, ()
     words = f"configuration {state.index}: {message}" if place else message
     goal = state.goal
     under_way = goal is not None and goal.over is None
-    state = _to(state, Phase.STOPPING, ending=Outcome(status, words))
+    ending = Outcome(status, words, advice=advice)
+    state = _to(state, Phase.STOPPING, ending=ending)
     if goal is None:
-        return _to(state, Phase.ENDED, outcome=state.ending), ()
+        return _to(state, Phase.ENDED, outcome=ending.with_words("")), ()
     return state, (Cancel(goal.number),) if under_way else ()
 
 
@@ -549,7 +559,7 @@ def _readying(state: Execution) -> tuple[Execution, Actions]:
     view, now = state.view, state.now
     dark = view.dark(now)
     if dark and state.moved:
-        return _end(state, "BEAM_LOST", _beam_lost(dark))
+        return _end(state, "BEAM_LOST", dark, BEAM_ADVICE)
     trouble = view.silence(now) or next(iter(view.missing), "")
     if not trouble and not view.stands:
         trouble = "the robot moves though nothing was sent: somebody else commands it"
@@ -567,10 +577,6 @@ def _readying(state: Execution) -> tuple[Execution, Actions]:
 
 def _waypoints(state: Execution) -> FloatArray:
     return state.job.visits[state.visit].waypoints
-
-
-def _beam_lost(dark: str) -> str:
-    return f"{dark}; bring the beam back, then send the rest of the plan"
 
 
 def _plan_way(state: Execution) -> tuple[Execution, Actions]:
@@ -621,7 +627,7 @@ def _confirming(state: Execution) -> tuple[Execution, Actions]:
     waited = state.view.watch.confirm_patience
     if state.now - state.since <= waited:
         return state, ()
-    return _end(state, "STOPPED", f"nobody called ~/confirm for {waited:g} s; send the rest of the plan")
+    return _end(state, "STOPPED", f"nobody called ~/confirm for {waited:g} s", "send the rest of the plan")
 
 
 def _moving(state: Execution) -> tuple[Execution, Actions]:
@@ -635,7 +641,7 @@ def _moving(state: Execution) -> tuple[Execution, Actions]:
     strays = _strays(state)
     if strays:
         advice = "find out why the robot does not follow (speed override, load), then lower speed_share"
-        return _end(state, "ABORTED", f"{strays}; {advice}", place=True)
+        return _end(state, "ABORTED", strays, advice, place=True)
     if _there(state):
         return _to(state, Phase.MEASURING, goal=replace(goal, arrived=True)), ()
     return _late(state)
@@ -649,7 +655,7 @@ def _trouble(state: Execution) -> tuple[Execution, Actions] | None:
     if silence:
         return _end(state, "ABORTED", silence, place=True)
     if dark:
-        return _end(state, "BEAM_LOST", _beam_lost(dark))
+        return _end(state, "BEAM_LOST", dark, BEAM_ADVICE)
     if goal.failure:
         if goal.accepted is None:
             status = "ABORTED" if state.moved else "NOT_READY"
@@ -739,8 +745,8 @@ def _stopping(state: Execution) -> tuple[Execution, Actions]:
     seen = view.stamp is not None and view.stamp >= max(state.since, goal.over or 0.0)
     stands = seen and view.stands and not view.silence(state.now)
     if stands and goal.over is not None:
-        done = f"; the robot stands, after {counted(state.executed, 'standstill')}"
-        return _to(state, Phase.ENDED, outcome=replace(ending, message=ending.message + done)), ()
+        done = f"the robot stands, after {counted(state.executed, 'standstill')}"
+        return _to(state, Phase.ENDED, outcome=ending.with_words(done)), ()
     if state.now - state.since <= view.watch.patience:
         return state, ()
     if view.silence(state.now) or not seen:
@@ -749,8 +755,7 @@ def _stopping(state: Execution) -> tuple[Execution, Actions]:
         words = "THE ROBOT STILL MOVES although its goal was cancelled: stop it by hand"
     else:
         words = "the robot stands, but the controller does not say that its move is over: look at it"
-    outcome = Outcome(ending.status, f"{ending.message}; {words}", alarm=True)
-    return _to(state, Phase.ENDED, outcome=outcome), ()
+    return _to(state, Phase.ENDED, outcome=ending.with_words(words, alarm=True)), ()
 
 
 NEXT: dict[Phase, Callable[[Execution], tuple[Execution, Actions]]] = {

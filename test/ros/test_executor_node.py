@@ -12,14 +12,17 @@ from action_msgs.msg import GoalStatus
 from bench import Bench
 from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import Plan as PlanMessage
+from rclpy.node import Node
 from robots import plan_of
 from std_srvs.srv import Trigger
 
 from calib_planner import Robot
+from calib_planner.planning import Pace, smooth_trajectory
 from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.nodes import executor as executor_module
 from calib_planner.ros.nodes.executor import ExecutorNode
 from calib_planner.ros.parameters import LATCHED
+from calib_planner.ros.ways import way_to_message
 
 pytest.importorskip("control_msgs.action", reason="control_msgs is not installed")
 
@@ -258,3 +261,60 @@ def test_deactivated_while_it_moves(shop: Shop) -> None:
     ended.join()
     assert status == "ABORTED" and message.startswith("the node was deactivated; the robot stands")
     assert shop.controller.cancels
+
+
+# ── MoveIt ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+class FakeMoveIt(Node):
+    """Answers requests for ways, with a detour and a joint that stands still; ``code`` is its error code."""
+
+    def __init__(self, context: Any = None, overrides: object = (), **options: Any) -> None:
+        from moveit_msgs.srv import GetMotionPlan
+
+        super().__init__("fake_moveit", context=context)
+        self.code, self.requests = 1, []  # type: ignore[var-annotated]
+        self.create_service(GetMotionPlan, "plan_kinematic_path", self._answer)
+
+    def _answer(self, request: Any, response: Any) -> Any:
+        wanted = request.motion_plan_request
+        self.requests.append(wanted)
+        answer = response.motion_plan_response
+        answer.error_code.val = self.code
+        start = np.array(wanted.start_state.joint_state.position)
+        goal = np.array([c.position for c in wanted.goal_constraints[0].joint_constraints])
+        middle = 0.5 * (start + goal) + 0.05
+        way = way_to_message(smooth_trajectory([start, middle, goal], Pace([3.0, 3.0])), ["q1", "q2"])
+        for point in way.points:  # in another order, with a joint that stands still
+            point.positions = [9.0, point.positions[1], point.positions[0]]
+            point.velocities = []
+        way.joint_names = ["gripper", "q2", "q1"]
+        answer.trajectory.joint_trajectory = way
+        return response
+
+
+def test_moveit_plans_every_move(bench: Bench) -> None:
+    pytest.importorskip("moveit_msgs.srv", reason="moveit_msgs is not installed")
+    shop = Shop(bench, moveit_group="manipulator", speed_share=0.5)
+    status, message, _ = shop.run()
+    assert status == "NOT_READY" and "nobody offers plan_kinematic_path: start move_group" in message
+    moveit = bench.start(FakeMoveIt)
+    bench.wait(shop.node._ways.service_is_ready)
+    status, message, executed = shop.run(times=2)
+    assert (status, executed) == ("SUCCESS", 4), message
+    assert len(moveit.requests) == 6, "there, aside and back, and the same again"
+    first = moveit.requests[0]
+    assert first.group_name == "manipulator" and first.max_velocity_scaling_factor == 0.5
+    sent = shop.controller.goals[0].trajectory
+    assert sent.joint_names == ["q1", "q2"]
+    assert max(abs(v) for p in sent.points for v in p.velocities) < 0.5 * 1.01, "no faster than half of 1 rad/s"
+    moveit.code = -12
+    status, message, _ = shop.run(rows=Q[:1])
+    assert status == "ABORTED" and "no way there was planned: MoveIt says GOAL_IN_COLLISION (-12)" in message
+
+
+def test_without_moveit_msgs(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executor_module, "GetMotionPlan", None)
+    shop = Shop(bench, moveit_group="manipulator")
+    status, message, _ = shop.run()
+    assert status == "NOT_READY" and "sudo apt install ros-$ROS_DISTRO-moveit-msgs" in message

@@ -274,6 +274,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         self._look_around()
         wanted.execution, actions = begin(job, self._view, self._time, self._number)
         self._act(actions)
+        self._tell(wanted.execution)
 
     def _lacking(self) -> str:
         """Why no plan can be executed at all; empty if that is not so."""
@@ -324,7 +325,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
     def _confirm(self) -> str:
         run = self._run
         if run is None or run.execution is None:
-            raise CalibPlannerError("nothing is being executed")
+            raise CalibPlannerError("nothing is being executed: send a plan, or call ~/execute")
         if refused := run.execution.refused_confirmation():
             raise CalibPlannerError(refused)
         self._feed(Confirmed())
@@ -389,10 +390,14 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
             self._finish(run, run.execution.outcome)
 
     def _tell(self, execution: Execution) -> None:
-        """Say what a person has to do, or what ends the execution."""
+        """Say where the robot goes, what a person has to do, or what ends the execution."""
+        job, goal = execution.job, execution.goal
+        if execution.phase is Phase.MOVING and goal is not None and not goal.arrived:
+            words = f"configuration {execution.index}, standstill {execution.visit + 1} of {len(job.visits)}"
+            self.get_logger().info(f"{words}: moving for {goal.way.seconds:.1f} s")
         if execution.phase is Phase.CONFIRMING:
-            rows = execution.job.visits[execution.visit].waypoints[-1].tolist()
-            names = zip(execution.job.joint_names, rows, strict=True)
+            rows = job.visits[execution.visit].waypoints[-1].tolist()
+            names = zip(job.joint_names, rows, strict=True)
             place = ", ".join(f"{name}={value:.4f}" for name, value in names)
             self.get_logger().warning(f"configuration {execution.index} ({place}) is next: call ~/confirm")
         elif execution.phase is Phase.STOPPING and execution.ending is not None:

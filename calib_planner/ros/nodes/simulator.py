@@ -120,7 +120,10 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
                 goal_callback=self._on_trajectory,
                 handle_accepted_callback=self._on_accepted,
             )
-        self.get_logger().info(f"{self.world.robot.name} with hidden errors stands still")
+        log = self.get_logger()
+        log.info(f"{self.world.robot.name} with hidden errors stands still")
+        if FollowJointTrajectory is not None:
+            log.info(f"it follows trajectories that come by the action {chosen.controller_action}")
 
     def deactivate(self) -> None:
         """End an execution that is under way."""
