@@ -24,7 +24,7 @@ longest time, so that every execution ends.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -125,6 +125,37 @@ class Beam:
             return f"{self.topic}: the tracker has said nothing for {now - self.heard:.1f} s"
         lost = not self.locked and now - self.changed >= watch.beam_patience
         return f"{self.topic}: the tracker has lost the reflector" if lost else ""
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Joint states that name some of the joints each, put together.
+
+    Attributes:
+        joints: (joints,) the newest positions [rad | m]; NaN before the first.
+        stamps: (joints,) and when they were read [s], those that came since the last whole state; NaN elsewhere.
+    """
+
+    joints: FloatArray
+    stamps: FloatArray
+
+    @staticmethod
+    def of(count: int) -> Joined:
+        """Before the first state of so many joints."""
+        return Joined(np.full(count, np.nan), np.full(count, np.nan))
+
+    def part(
+        self, stamp: float, columns: Sequence[int] | None, joints: FloatArray
+    ) -> tuple[Joined, float | None]:
+        """Take a state of the joints ``columns``, ``None``: all.
+
+        Also gives the oldest stamp [s] of a state that is whole now, ``None`` if it is not.
+        """
+        q, stamps = self.joints.copy(), self.stamps.copy()
+        rows = slice(None) if columns is None else list(columns)
+        q[rows], stamps[rows] = joints, stamp
+        whole = not np.isnan(stamps).any()
+        return Joined(q, np.full(len(q), np.nan) if whole else stamps), float(stamps.min()) if whole else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,7 @@ ERROR_MODEL = "how the robot errs: typical, paper (noise alone), or the path of 
 FRAME = "accuracy at the test poses: in the frame of the points (world), or up to a rigid motion (robot)"
 BASE_FRAME = "name of the robot's base frame"
 TOPICS = "topics of the tracker's points, one per target"
+JOINT_TOPICS = "topics of the joint states: one, or several with some of the joints each"
 PLAN_TOPIC = "topic of the plan that ~/execute executes"
 CELL = (
     "path of a cell.yaml, whose robot, instrument, constraints and error model take the place of the parameters "
@@ -134,9 +135,7 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
     error_model: str = at_configure("typical", ERROR_MODEL)
     accuracy_frame: str = parameter("world", FRAME, choices=ACCURACIES)
     frame_id: str = parameter("base_link", BASE_FRAME)
-    joint_topics: tuple[str, ...] = at_configure(
-        ("joint_states",), "topics of the joint states: one, or several with some of the joints each"
-    )
+    joint_topics: tuple[str, ...] = at_configure(("joint_states",), JOINT_TOPICS)
     publish_transforms: bool = at_configure(
         True, "publish base to tracker and tip to targets on /tf_static, if tf2_msgs is installed"
     )
@@ -224,6 +223,7 @@ class ExecutorParameters(Watch, PaceParameters, RobotParameters):
     plan_topic: str = at_configure(
         "calibration_planner/current_plan", "topic of the plan that ~/execute executes"
     )
+    joint_topics: tuple[str, ...] = at_configure(("joint_states",), JOINT_TOPICS)
     locked_topics: tuple[str, ...] = at_configure(
         ("tracker/locked",),
         "topics std_msgs/Bool on which the tracker says whether it holds a target, one per target; a topic on "

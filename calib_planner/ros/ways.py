@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from calib_planner.acquisition import NANO
 from calib_planner.arrays import FloatArray
 from calib_planner.errors import CalibPlannerError, InputError
 from calib_planner.planning import Trajectory
+from calib_planner.ros.messages import duration_message, seconds_of
 from calib_planner.units import listed
 
 try:
@@ -38,12 +37,6 @@ GOAL_RANGE = 1e-4
 """How near MoveIt has to plan to a configuration, either side [rad | m]."""
 SUCCESS = 1
 """``moveit_msgs/MoveItErrorCodes.SUCCESS``."""
-
-
-def duration_message(seconds: float) -> Duration:
-    """A time [s] as message."""
-    whole = round(seconds * NANO)
-    return Duration(sec=whole // NANO, nanosec=whole % NANO)
 
 
 def way_to_message(way: Trajectory, joint_names: Sequence[str]) -> JointTrajectory:
@@ -83,7 +76,7 @@ def way_from_message(message: JointTrajectory, joint_names: Sequence[str], start
     if len(rows) and others and np.ptp(rows[:, others], axis=0).max() > STRAY:
         got = listed(names[k] for k in others)
         raise InputError("trajectory", f"a way that moves {got} as well", f"one of {', '.join(joint_names)}")
-    times = np.array([p.time_from_start.sec + p.time_from_start.nanosec / NANO for p in message.points], float)
+    times = np.array([seconds_of(p.time_from_start) for p in message.points], float)
     q = rows[:, columns]
     if len(q) and all(len(p.velocities) for p in message.points):
         speeds = np.array([p.velocities for p in message.points], float)[:, columns]

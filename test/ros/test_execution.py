@@ -23,6 +23,7 @@ from calib_planner.ros.execution import (
     Finished,
     Halted,
     Job,
+    Joined,
     Looked,
     PlanWay,
     Send,
@@ -536,3 +537,18 @@ def test_what_is_no_trajectory(times: list[float], words: str) -> None:
 def test_a_job_of_a_robot_that_slides_names_its_units() -> None:
     job: Job = cell().job
     assert job.units == ("rad", "rad") and job.joint_names == ("q1", "q2")
+
+
+def test_joints_in_parts_are_put_together_once_each_has_come() -> None:
+    view, joined = View(Watch()), Joined.of(2)
+    for stamp, columns, values in [
+        (1.0, (1,), [7.0]),
+        (1.1, (1,), [8.0]),
+        (1.2, (0,), [3.0]),
+        (1.3, (0,), [4.0]),
+    ]:
+        joined, whole = joined.part(stamp, columns, np.array(values))
+        view = view if whole is None else view.seen(whole, joined.joints)
+    assert view.stamp == 1.1 and view.joints.tolist() == [3.0, 8.0]
+    joined, whole = joined.part(1.4, None, np.array([5.0, 6.0]))
+    assert whole == 1.4 and joined.joints.tolist() == [5.0, 6.0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +11,7 @@ from action_msgs.msg import GoalStatus
 from bench import Bench
 from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import Plan as PlanMessage
+from lifecycle_msgs.msg import Transition
 from rclpy.node import Node
 from robots import plan_of
 from std_srvs.srv import Trigger
@@ -187,20 +187,14 @@ def test_stopped_cancelled_or_without_a_beam(shop: Shop, phase: str) -> None:
     assert shop.call("stop").message == "nothing is being executed"
 
 
-def test_a_robot_that_does_not_stop(shop: Shop) -> None:
-    shop.controller.manner = Manner(halts=False, rate=0.97)
-    handle = shop.goal(rows=np.array([[2.5, -2.5]]), times=1)
-    shop.reach("MOVING")
-    shop.bench.wait(lambda: shop.controller.arm.way is not None)
-    shop.controller.arm.way = executor_slow(shop.controller.arm.way)
+def test_a_robot_that_does_not_stop(bench: Bench) -> None:
+    shop = Shop(bench, joint_speed=0.1, patience=2.0)
+    shop.controller.manner = Manner(halts=False)
+    handle = shop.goal(rows=np.array([[2.0, -2.0]]), times=1)
+    bench.wait(lambda: shop.controller.joints[0] > 0.2)
     answer = shop.call("stop")
     assert not answer.success and "THE ROBOT STILL MOVES" in answer.message
     assert "THE ROBOT STILL MOVES" in shop.result(handle)[1]
-
-
-def executor_slow(way: Any) -> Any:
-    """The same way in a hundred times the time."""
-    return type(way)(way.times * 100.0, way.positions, way.velocities / 100.0)
 
 
 def test_step_by_step(bench: Bench) -> None:
@@ -211,7 +205,7 @@ def test_step_by_step(bench: Bench) -> None:
         assert len(shop.controller.goals) == number
         assert shop.call("confirm").message == "confirmed: the robot moves"
     assert shop.result(handle)[0] == "SUCCESS"
-    assert shop.call("confirm").message == "nothing is being executed"
+    assert shop.call("confirm").message == "nothing is being executed: send a plan, or call ~/execute"
 
 
 def test_silence_ends_it(bench: Bench) -> None:
@@ -252,14 +246,13 @@ def test_without_control_msgs(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_deactivated_while_it_moves(shop: Shop) -> None:
-    handle = shop.goal()
+    shop.goal()
     shop.reach("MOVING")
     shop.bench.wait(lambda: shop.controller.arm.way is not None)
-    ended = threading.Thread(target=shop.node.trigger_deactivate)
-    ended.start()
-    status, message, _ = shop.result(handle)
-    ended.join()
-    assert status == "ABORTED" and message.startswith("the node was deactivated; the robot stands")
+    run = shop.node._run
+    assert shop.bench.change_state("plan_executor", Transition.TRANSITION_DEACTIVATE)
+    assert run is not None and run.outcome is not None
+    assert run.outcome.message.startswith("the node was deactivated; the robot stands")
     assert shop.controller.cancels
 
 

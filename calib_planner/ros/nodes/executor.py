@@ -41,6 +41,7 @@ from calib_planner.ros.execution import (
     Finished,
     Halted,
     Job,
+    Joined,
     Looked,
     Outcome,
     Phase,
@@ -113,6 +114,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         self._notes: deque[Callable[[], None]] = deque()
+        self._turn = threading.RLock()  # at the end of the process no callback group orders the threads any more
         self._run: Run | None = None
         self._number = 0
         self._names: dict[int, UUID] = {}
@@ -127,9 +129,8 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         self._source.follow(self, self._on_model)
         topics = [t for t in chosen.locked_topics if t]
         self._forget(tuple(Beam(t) for t in topics))
-        self._streams = StreamPoller(
-            self, [Stream(JointState, "joint_states", self._on_joints, lambda _: None)], STREAM_IN
-        )
+        joints = [Stream(JointState, t, self._on_joints, lambda _: None) for t in chosen.joint_topics]
+        self._streams = StreamPoller(self, joints, STREAM_IN)
         for index, topic in enumerate(topics):
             self.create_subscription(Bool, topic, partial(self._on_locked, index), STREAM_IN)
         self._arm = self._ways = None
@@ -177,7 +178,8 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
             self._tick()
             time.sleep(PERIOD)
             self._streams.poll()
-            stands = self._view.stands and self._view.rest > began
+            view = self._view
+            stands = view.stands and view.stamp is not None and view.stamp > began + 2.0 * view.watch.still_time
         if stands:
             self._finish(run, Outcome("ABORTED", f"{words}; the robot stands"))
         self._finish(run, Outcome("ABORTED", f"{words}; THE ROBOT WAS NOT SEEN TO STAND: look at it", alarm=True))
@@ -188,27 +190,31 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         self._view = View(watch, beams)
         self._reader: JointReader | None = None
         if isinstance(self._source.model, Model):
-            self._reader = JointReader(self._source.model.robot.joint_names)
+            names = self._source.model.robot.joint_names
+            self._reader, self._joined = JointReader(names), Joined.of(len(names))
 
     # ── what is heard ────────────────────────────────────────────────────────────────────────────────
 
     def _on_model(self, model: Model) -> None:
         self.get_logger().info(f"{TOPIC}: {model.robot.name}, joints {', '.join(model.robot.joint_names)}")
         self._forget(self._view.beams)
-        if self._run is not None:
-            self._feed(Halted("ABORTED", f"another robot was described on {TOPIC} meanwhile"))
+        run, words = self._run, f"another robot was described on {TOPIC} meanwhile"
+        if run is not None:
+            self._notes.append(partial(self._feed_to, run, Halted("ABORTED", words)))
 
     def _on_joints(self, message: JointState) -> None:
         if self._reader is None:
             return
         try:
-            part, joints = self._reader.read(message)
+            columns, part = self._reader.read(message)
         except CalibPlannerError as error:
             self.get_logger().warning(f"joint_states: {cut(error, 500)}", throttle_duration_sec=5.0)
             return
         stamp = nanoseconds(message.header.stamp)
-        if part is None and stamp > 0:
-            self._view = self._view.seen(stamp / NANO, joints)
+        if stamp > 0:
+            self._joined, whole = self._joined.part(stamp / NANO, columns, part)
+            if whole is not None:
+                self._view = self._view.seen(whole, self._joined.joints)
 
     def _on_locked(self, index: int, message: Bool) -> None:
         self._view = self._view.beam(index, bool(message.data), self._time)
@@ -231,7 +237,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
                 goal.publish_feedback(_feedback(wanted.execution))
         outcome = wanted.outcome or Outcome("ABORTED", "the node is ending")
         executed = 0 if wanted.execution is None else wanted.execution.executed
-        status = getattr(ExecutePlan.Result, outcome.status, ExecutePlan.Result.ABORTED)
+        status = getattr(ExecutePlan.Result, outcome.status)
         result = ExecutePlan.Result(status=status, message=cut(outcome.message), executed=executed)
         if not self.context.ok():
             return result  # the process is ending, and the result is not sent
@@ -301,7 +307,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
             plan_pace(chosen, model),
             self._view.joints,
             dwell=dwell_of(goal),
-            step=chosen.step or getattr(goal, "step", False),
+            step=chosen.step or goal.step,
             planning_time=chosen.planning_time if chosen.moveit_group else 0.0,
         )
 
@@ -328,7 +334,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
             raise CalibPlannerError("nothing is being executed: send a plan, or call ~/execute")
         if refused := run.execution.refused_confirmation():
             raise CalibPlannerError(refused)
-        self._feed(Confirmed())
+        self._notes.append(partial(self._feed_to, run, Confirmed()))
         return "confirmed: the robot moves"
 
     def _halt(self) -> str:
@@ -348,14 +354,15 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
 
     def _tick(self) -> None:
         """Read the notes, look at the clock."""
-        while self._notes:
-            self._notes.popleft()()
-        run = self._run
-        if run is not None and run.execution is None:
-            self._begin(run)
-        elif run is not None:
-            self._look_around()
-            self._feed(Looked())
+        with self._turn:
+            while self._notes:
+                self._notes.popleft()()
+            run = self._run
+            if run is not None and run.execution is None:
+                self._begin(run)
+            elif run is not None:
+                self._look_around()
+                self._feed(Looked())
 
     def _look_around(self) -> None:
         """Note who is not there."""
