@@ -28,7 +28,7 @@ from calib_planner.ros.rclpy_ext.lasting import LastingActionServer
 from calib_planner.ros.ways import way_from_message
 
 NAMES = ("q1", "q2")
-STEP = 0.02
+STEP = 0.04
 """Simulated time between two joint states [s]."""
 ACTION = "joint_trajectory_controller/follow_joint_trajectory"
 PREEMPTED = "Current goal cancelled due to new incoming action."
