@@ -1,9 +1,9 @@
 """Processor time of the tests by room, printed at the end of a run (a pytest plugin, also with pytest-xdist).
 
 Every report of a test carries the processor time that its process and the ended children of that process used
-since the report before, with the test's set-up and tear-down. What is left is start, collection and end. Time by the
-clock would count the neighbours of a busy machine; a test that waits costs little processor time, so the clock's
-time stands beside it.
+since the report before, with the test's set-up and tear-down. What is left is start, collection and end. Time by
+the clock would count the neighbours of a busy machine; a test that waits costs little processor time, so the
+clock's time stands beside it.
 """
 
 from __future__ import annotations
