@@ -13,7 +13,7 @@ demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 	@. ./env.sh && python -m calib_planner.ros.demo
 
 test: setup ## run every test, in as many processes as there are cores (PYTEST='-k plan' for some)
-	@. ./env.sh && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
+	@. ./env.sh && unset PYTHONDONTWRITEBYTECODE && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 prove: setup ## every test with all its seeds and turns, of which make test takes a sample
 	@CALIB_PLANNER_PROVE=1 $(MAKE) test

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import resource
 from collections import defaultdict
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-TESTS = Path(__file__).parent
+MOST = 60
+"""So many lines are printed, the costliest ones."""
 
 
 def processor_seconds() -> float:
@@ -24,8 +25,22 @@ def processor_seconds() -> float:
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
+def file_of(test: str) -> str:
+    return test.split("::")[0]
+
+
+def room_of(test: str) -> str:
+    """The room that a test belongs to: its folder in test/."""
+    return "/".join(file_of(test).split("/")[:-1][:2])
+
+
+NAMES: dict[str, Callable[[str], str]] = {"room": room_of, "file": file_of, "test": str}
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--time-by", choices=("room", "file"), default="room", help="processor time by room or file")
+    parser.addoption(
+        "--time-by", choices=NAMES, default="room", help="of what the processor time is printed at the end"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -38,7 +53,6 @@ class ProcessorTime:
     def __init__(self) -> None:
         self._before = 0.0
         self._apart = 0.0
-        self._total = 0.0
 
     def _lap(self) -> float:
         """Processor time [s] since the last call."""
@@ -66,25 +80,18 @@ class ProcessorTime:
         self._apart += getattr(node, "workeroutput", {}).get("processor_seconds_apart", 0.0)
 
     def pytest_terminal_summary(self, terminalreporter: Any, config: pytest.Config) -> None:
-        by_file = config.getoption("time_by") == "file"
+        name_of = NAMES[config.getoption("time_by")]
         rows: dict[str, list[float]] = defaultdict(lambda: [0, 0.0, 0.0])
         for reports in terminalreporter.stats.values():
             for report in reports:
                 if hasattr(report, "processor_seconds"):
-                    path = Path(report.location[0])
-                    row = rows[str(path) if by_file else room(path)]
+                    row = rows[name_of(report.nodeid)]
                     row[0] += report.when == "call"
                     row[1] += report.processor_seconds
                     row[2] += report.duration
         rows["start, collection, end"] = [0, self._apart, 0.0]
         rows["together"] = [sum(column) for column in zip(*rows.values(), strict=True)]
-        terminalreporter.section("processor time by room")
-        terminalreporter.write_line(f"{'':44} {'tests':>6} {'processor s':>12} {'clock s':>9}")
-        for name, (count, processor, clock) in sorted(rows.items(), key=lambda item: -item[1][1]):
-            terminalreporter.write_line(f"{name:44} {count:6.0f} {processor:12.1f} {clock:9.1f}")
-
-
-def room(path: Path) -> str:
-    """The room that a test file, relative to the repository's root, belongs to: its folder in test/."""
-    folders = path.parts[:-1]
-    return "/".join(folders[:2]) or "."
+        terminalreporter.section("processor time")
+        terminalreporter.write_line(f"{'processor s':>12} {'clock s':>9} {'tests':>6}")
+        for name, (count, processor, clock) in sorted(rows.items(), key=lambda item: -item[1][1])[:MOST]:
+            terminalreporter.write_line(f"{processor:12.1f} {clock:9.1f} {count:6.0f}  {name}")

@@ -217,7 +217,6 @@ class Solution:
         value: −2 log L of (2) or (3), constants left out.
         coefficients: (coefficients,) γ̂ as Z γ̂, and û − ū; flat ones are changes from where it was linearised.
         weighted: (N, m) P y [1/m].
-        squares: (K,) λ_k b_kᵀ P b_k.
         pulls: (K,) λ_k^½ b_kᵀ P y.
     """
 
@@ -225,8 +224,12 @@ class Solution:
     value: float
     coefficients: FloatArray
     weighted: FloatArray
-    squares: FloatArray
     pulls: FloatArray
+
+    @cached_property
+    def squares(self) -> FloatArray:
+        """(K,) λ_k b_kᵀ P b_k; a step that is tried and given up never needs them."""
+        raise NotImplementedError
 
     @cached_property
     def blocks(self) -> FloatArray:
@@ -265,6 +268,11 @@ class DenseSolution(Solution):
     projection: FloatArray
     spread: FloatArray
     carried: FloatArray
+
+    @cached_property
+    def squares(self) -> FloatArray:
+        scaled = self.problem.scaled_columns
+        return np.asarray(np.einsum("ak,ak->k", scaled, self.projection @ scaled))
 
     @cached_property
     def blocks(self) -> FloatArray:
@@ -314,6 +322,11 @@ class CoefficientSolution(Solution):
     half: FloatArray
 
     @cached_property
+    def squares(self) -> FloatArray:
+        rank = self.problem.flat_columns.shape[1]
+        return np.asarray(1.0 - np.sum(self.half[rank:] ** 2, axis=1))
+
+    @cached_property
     def blocks(self) -> FloatArray:
         n, m = self.problem.y.shape
         share = (self.white @ self.half).reshape(n, m, -1)
@@ -359,6 +372,11 @@ class UpdatedSolution(Solution):
     spread: FloatArray
     reduced: FloatArray
     fitted: FloatArray
+
+    @cached_property
+    def squares(self) -> FloatArray:
+        rank = self.problem.basis.shape[1]
+        return np.asarray(1.0 - np.diag(self.inverse)[rank:])
 
     @cached_property
     def blocks(self) -> FloatArray:
@@ -412,7 +430,6 @@ def dense(problem: LinearProblem) -> DenseSolution:
         float(value),
         problem.expand(np.append(spread @ (carried.T @ y), pulls)),
         pulled.reshape(n, m),
-        np.einsum("ak,ak->k", scaled, projection @ scaled),
         pulls,
         projection,
         spread,
@@ -446,7 +463,6 @@ def by_coefficients(problem: LinearProblem) -> CoefficientSolution:
         float(value),
         problem.expand(solution),
         (transposed @ rest.reshape(n, m, 1))[:, :, 0],
-        1.0 - np.sum(half[rank:] ** 2, axis=1),
         solution[rank:],
         inverse,
         white,
@@ -608,7 +624,6 @@ def _finished(
         value,
         problem.expand(reduced),
         weighted,
-        1.0 - np.diag(inverse)[rank:],
         reduced[rank:],
         rows,
         precision,

@@ -69,7 +69,7 @@ def test_repetitions_tell_the_noise_and_places_the_rest() -> None:
 )
 def test_a_block_of_rows_that_is_shifted_is_named(size: float, sigma: float | None) -> None:
     """The tracker was pushed for twelve visits of forty, and put back."""
-    for seed in range(repeats(2, 10)):
+    for seed in range(repeats(1, 10)):
         cell, robot = placed_cell(seed)
         data = bare(cell.measure(random_configurations(robot, 40, seed), 1, seed))
         points = np.array(data.p)
@@ -87,7 +87,7 @@ def test_errors_twice_as_large_as_the_prior_says_are_an_estimate(sigma: float | 
     """1 mm and 3 mrad; a prior of 0.5 mm and 1 mrad is in the way no more than it has to be."""
     robot = Robot.load("ur10e").with_targets(TARGETS).with_parameters("full", ("base", "tool"))
     chain = Robot.load("ur10e").with_targets(TARGETS).with_parameters("full")
-    for seed in range(repeats(2, 8)):
+    for seed in range(repeats(1, 8)):
         cell = SimulatedCell(chain, random_deviations(chain, seed, 1e-3, 3e-3), SIGMA)
         data = bare(cell.measure(random_configurations(chain, 30, seed), 1, seed))
         estimate = identify(IdentificationProblem(robot, data, sigma, prior=typical_prior(robot)))

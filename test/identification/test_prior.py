@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cells import ANGLE, LENGTH, SIGMA, bare, plain_cell
-from robots import mixed, random_configurations
+from robots import mixed, random_configurations, repeats
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.stats import chi2
@@ -99,7 +99,7 @@ def test_uncertainty_is_right_where_the_truth_comes_from_the_prior(level, count,
     With more terms than the truth has the uncertainty may be larger than it is, and no smaller.
     """
     total, freedom = 0.0, 0
-    for seed in range(20):
+    for seed in range(repeats(10, 20)):
         cell, prior, data = drawn(seed, level, count)
         estimate = identify(IdentificationProblem(cell.nominal, data, SIGMA, model, prior=prior))
         assert estimate.fit.status == "ok"
@@ -117,7 +117,7 @@ def test_uncertainty_is_right_where_the_truth_comes_from_the_prior(level, count,
 def test_unknown_noise_beside_a_prior_is_neither_over_nor_underestimated(level, count):
     """What the prior decides costs no degrees of freedom, what the data decide does."""
     squares = []
-    for seed in range(30):
+    for seed in range(repeats(10, 30)):
         cell, prior, data = drawn(seed, level, count)
         estimate = identify(IdentificationProblem(cell.nominal, data, error_model=PAPER, prior=prior))
         assert estimate.fit.status == "ok"
