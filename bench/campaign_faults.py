@@ -97,7 +97,7 @@ def given(faults: Faults, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
     usual = asdict(Faults())
     off = {name: value for name, value in asdict(faults).items() if value != usual[name]}
     simulator = {"robot": ROBOT, "error_model": "paper", "seed": seed, "joint_speed": 12.0, "dwell": 0.5}
-    identifier = {"robot": ROBOT, "error_model": "paper", "plan_topic": f"{NAME}/plan", "keep_measurements": True}
+    identifier = {"robot": ROBOT, "error_model": "paper", "plan_topic": f"{NAME}/plan"}
     campaign = {
         "robot": ROBOT,
         "error_model": "paper",

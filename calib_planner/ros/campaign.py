@@ -10,11 +10,13 @@ goes on when a person says so: ``Measuring`` is ``halted``.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +38,7 @@ from calib_planner.campaign import (
     Paused,
 )
 from calib_planner.errors import InputError
-from calib_planner.io import write_estimate, write_measurements
+from calib_planner.io import config_folder, write_estimate, write_measurements
 from calib_planner.measurements import configuration_labels
 from calib_planner.planning import Plan, PlanQuality
 from calib_planner.ros.cell import error_model_of, instrument_of
@@ -66,6 +68,7 @@ GOALS = (
     "parameters",
     "unknown",
     "targets",
+    "cell",
     "constraints",
     "error_model",
     *SAME,
@@ -74,8 +77,17 @@ GOALS = (
 
 
 def goals_of(settings: CampaignParameters) -> dict[str, Any]:
-    """What the record of a campaign keeps of the parameters."""
-    return {name: getattr(settings, name) for name in GOALS}
+    """What the record of a campaign keeps of the parameters, and marks of the files that they name."""
+    return {name: getattr(settings, name) for name in GOALS} | {"sha256": _marks_of_files(settings)}
+
+
+def _marks_of_files(settings: CampaignParameters) -> dict[str, str]:
+    """Name of a parameter → hash of the file that it names."""
+    folder = Path(settings.constraints_folder) if settings.constraints_folder else config_folder()
+    places = {"cell": Path(settings.cell), "error_model": Path(settings.error_model)}
+    places["constraints"] = folder / settings.constraints
+    files = {name: path.expanduser() for name, path in places.items() if getattr(settings, name)}
+    return {name: hashlib.sha256(p.read_bytes()).hexdigest() for name, p in files.items() if p.is_file()}
 
 
 def with_goals(settings: CampaignParameters, goals: Mapping[str, Any]) -> tuple[CampaignParameters, list[str]]:
@@ -102,7 +114,12 @@ def with_goals(settings: CampaignParameters, goals: Mapping[str, Any]) -> tuple[
         stored[name] = type(now)(value)
         if stored[name] != now:
             differing.append(f"{name} is {cut(str(value), 100)!r} in the record, {cut(str(now), 100)!r} here")
-    return replace(settings, **stored), differing
+    restored = replace(settings, **stored)
+    now_there, then = _marks_of_files(restored), goals.get("sha256")
+    for name, mark in then.items() if isinstance(then, dict) else ():
+        if now_there.get(name) != mark:
+            differing.append(f"the file that {name} names has changed since, and counts as it is now")
+    return restored, differing
 
 
 def problem_of(settings: CampaignParameters, model: Model | NotReady) -> CampaignProblem:

@@ -91,7 +91,7 @@ def node_parameters(path: str | Path, *, simulate: bool, executor: bool) -> dict
     robot = "tracker_simulator" if simulate and not executor else "plan_executor"
     parts: dict[str, Parameters] = {
         "planner": {},
-        "identifier": {"plan_topic": "calibration_campaign/plan", "keep_measurements": True},
+        "identifier": {"plan_topic": "calibration_campaign/plan"},
         "campaign": {"execute_action": f"{robot}/execute_plan"},
         "executor": {},
         "page": {"executor": robot},
