@@ -167,11 +167,20 @@ class JointRest:
 
     Attributes:
         parts: The parts, in the order of their first joints.
+        at_rest: Whether every part has samples of a rest.
+        since, last: From when on, and until when, all are seen at rest [ns].
+        until: Stamp up to which every part was heard, at rest or not [ns]; ``None`` before.
     """
+
+    at_rest: bool
+    since: int
+    last: int
+    until: int | None
 
     def __init__(self, window: RestWindow, joints: int) -> None:
         self._window = window
         self.parts = [self._part(range(joints))]
+        self._follow()
 
     def _part(self, columns: Iterable[int]) -> JointPart:
         return JointPart(tuple(columns), replace(self._window, samples=self._window.samples.copy()))
@@ -184,11 +193,13 @@ class JointRest:
             parts += [self._part(half) for half in both] if all(both) else [part]
             divided += [part] if all(both) else []
         self.parts = sorted(parts, key=lambda p: p.columns)
+        self._follow()
         return divided
 
     def begin(self) -> None:
         """Forget everything but the parts."""
         self.parts = [self._part(p.columns) for p in self.parts]
+        self._follow()
 
     @property
     def gap(self) -> int:
@@ -200,26 +211,24 @@ class JointRest:
         """Largest range of a joint [rad | m]."""
         return self._window.tolerance
 
-    @property
-    def at_rest(self) -> bool:
-        """Whether every part has samples of a rest."""
-        return all(p.window.samples for p in self.parts)
-
-    @property
-    def since(self) -> int:
-        """From when on all are at rest [ns]."""
-        return max([p.window.since for p in self.parts])
-
-    @property
-    def last(self) -> int:
-        """Until when all are seen at rest [ns]."""
-        return min([p.window.last for p in self.parts])
-
-    @property
-    def until(self) -> int | None:
-        """Stamp up to which every part was heard, at rest or not [ns]; ``None`` before."""
+    def _follow(self) -> None:
+        """Note what the parts say together: it is looked up at every message, and changes with joints only."""
+        windows = [p.window for p in self.parts]
         stamps = [p.until for p in self.parts if p.until is not None]
-        return min(stamps) if len(stamps) == len(self.parts) else None
+        self.at_rest = all(w.samples for w in windows)
+        self.since, self.last = max([w.since for w in windows]), min([w.last for w in windows])
+        self.until = min(stamps) if len(stamps) == len(windows) else None
+
+    def hear(self, part: JointPart, stamp: int) -> None:
+        """A part was heard, whose samples do not matter now."""
+        part.until = stamp
+        self._follow()
+
+    def push(self, part: JointPart, stamp: int, value: FloatArray) -> None:
+        """Take a sample of a part."""
+        part.until = stamp
+        part.window.push(stamp, value)
+        self._follow()
 
     @property
     def newest(self) -> FloatArray:
@@ -234,6 +243,7 @@ class JointRest:
         """Forget the samples."""
         for part in self.parts:
             part.window.samples.clear()
+        self._follow()
 
     def end(self, moved: JointPart) -> None:
         """The rest is over, since ``moved`` moves or is silent; others begin anew with their newest sample.
@@ -244,6 +254,7 @@ class JointRest:
         for part in self.parts:
             if part.window.samples:
                 part.window.restart()
+        self._follow()
 
     def mean(self, start: int, end: int) -> FloatArray:
         """(n,) mean positions over [start, end] [ns], in a rest that lasts from before to after.

@@ -358,11 +358,11 @@ class StandstillDetector:
 
     def _on_joints(self, part: JointPart, stamp: int, value: FloatArray) -> list[Standstill | Rejection]:
         joints, results = self._joints, []
-        until, part.until = joints.until, stamp
         if self._measured is not None:
             if np.max(np.abs(value - self._measured[list(part.columns)])) <= joints.tolerance:
+                joints.hear(part, stamp)
                 return []
-            self.clocks.add_joints(self._measured_since, until or stamp)
+            self.clocks.add_joints(self._measured_since, joints.until or stamp)
             self._measured = None
             joints.clear()
         elif (
@@ -375,7 +375,7 @@ class StandstillDetector:
                 loss.seen = loss.now
             for window in self._targets:
                 window.moved_by, window.before = 0.0, None
-        part.window.push(stamp, value)
+        joints.push(part, stamp, value)
         return results
 
     def _moved_on(self, part: JointPart) -> list[Standstill | Rejection]:
