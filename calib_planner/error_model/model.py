@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +46,8 @@ MEANINGS = {
     Points.name: Points.title,
 }
 """Term, or component of the joint functions → what it means."""
+OPTIONAL_TERMS = (Gravity.name, JointFunctions.name, Visits.name)
+"""Terms that a model may be without."""
 
 
 @dataclass(frozen=True)
@@ -158,21 +161,24 @@ class ErrorModel:
         if self.joint_functions is not None and term in self.joint_functions.components:
             left = tuple(c for c in self.joint_functions.components if c != term)
             return replace(self, joint_functions=JointFunctions(left) if left else None)
-        if term == "gravity":
-            return replace(self, gravity=None)
-        if term == "joint_functions":
-            return replace(self, joint_functions=None)
-        if term == "visits":
-            return replace(self, visits=None)
-        raise UnknownNameError("term", term, ("gravity", "joint_functions", "smooth", "short", "visits"))
+        changes: dict[str, Any] = {term: None}
+        if term not in OPTIONAL_TERMS:
+            raise UnknownNameError("term", term, (*OPTIONAL_TERMS, "smooth", "short"))
+        return replace(self, **changes)
+
+    @property
+    def placement_alone(self) -> ErrorModel:
+        """The same without the terms beside placement that bring columns."""
+        changes: dict[str, Any] = {term.name: None for term in self.systematic[1:]}
+        return replace(self, **changes)
 
     # ── what it is ───────────────────────────────────────────────────────────────────────────────────
 
     @property
     def terms(self) -> tuple[Placement | Gravity | JointFunctions | Visits | Points, ...]:
         """The terms that are there."""
-        all_of_them = (self.placement, self.gravity, self.joint_functions, self.visits, self.points)
-        return tuple(t for t in all_of_them if t is not None)
+        scattering = () if self.visits is None else (self.visits,)
+        return (*self.systematic, *scattering, self.points)
 
     @property
     def is_papers(self) -> bool:
@@ -238,8 +244,8 @@ class ErrorModel:
             coefficients: β; those of placement do not matter.
         """
         total, where = np.zeros(poses.q.shape), self.slices(poses.robot)
-        for term in (self.gravity, self.joint_functions):
-            if term is not None:
+        for term in self.systematic:
+            if not isinstance(term, Placement):
                 total += term.deflection(poses, coefficients[where[term.name]])
         return total
 

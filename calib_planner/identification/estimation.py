@@ -549,10 +549,10 @@ def placement_alone(fit: ModelEstimate, start: PlacementAlone | None = None) -> 
     """
     problem, origin = fit.solution.problem, fit.origin
     model, robot = problem.model, problem.robot
-    if model.gravity is None and model.joint_functions is None:
+    if len(model.systematic) == 1:
         known = replace(fit.knowledge, robot=robot, coefficients=origin.coefficients)
         return PlacementAlone(known, fit.left_out, fit.converged)
-    alone = replace(model, gravity=None, joint_functions=None)
+    alone = model.placement_alone
     work = _Work(robot, origin.data, alone)
     count = len(robot.parameter_names)
     if start is None:
@@ -778,7 +778,7 @@ def _some(data: Measurements) -> FloatArray | None:
 def _optional(model: ErrorModel) -> tuple[str, ...]:
     """Terms of this model that go if the left-out score is surely worse with them."""
     components = () if model.joint_functions is None else model.joint_functions.components
-    there = (*components, *(("gravity",) if model.gravity is not None else ()))
+    there = (*components, *(term.name for term in model.systematic))
     return tuple(t for t in OPTIONAL if t in there)
 
 
