@@ -7,7 +7,9 @@ from datetime import date
 from pathlib import Path
 
 import headers
+import room_picture
 import version
+from test_rooms import ROOMS
 
 ROOT = Path(__file__).parents[1]
 
@@ -38,3 +40,10 @@ def test_headers_go_behind_what_must_be_first() -> None:
     for name in ("a.sh", "a.py"):
         assert headers.with_header(Path(name), script) == script
     assert headers.with_header(Path("a.c"), "int x;\n").startswith("/* Copyright ")
+
+
+def test_the_picture_of_the_rooms_is_what_the_page_and_the_test_say() -> None:
+    page = room_picture.rooms(room_picture.PAGE.read_text(encoding="utf-8"))
+    assert page == {room: set(uses.split()) for room, uses in ROOMS.items()}
+    assert room_picture.drawn(page) == room_picture.PICTURE.read_text(encoding="utf-8"), "tools/room_picture.py"
+    assert room_picture.nearest({"a": set(), "b": {"a"}, "c": {"a", "b"}})["c"] == {"b"}

@@ -1,4 +1,4 @@
-"""The nodes' parameters, topics, services and actions, and the interfaces, are what ``expected/`` says."""
+"""What doors, nodes and interfaces offer is what ``expected/`` says."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
+from doors import doors
 from golden import differences, kept, stored
 from surface import interfaces, nodes, own_domain
+
+
+def test_doors_offer_the_same() -> None:
+    changed = list(differences(stored("doors"), doors()))
+    assert not changed, "\n".join([*changed[:20], "intended? python test/golden/update.py doors"])
 
 
 def test_interfaces_are_the_same() -> None:

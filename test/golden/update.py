@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cases import CASES, REAL
+from doors import doors
 from golden import EXPECTED, Inputs, answer, arithmetic, differences, kept, same_arithmetic, store, stored
 
-OTHERS = ("nodes", "interfaces", "arithmetic")
+OTHERS = ("doors", "nodes", "interfaces", "arithmetic")
 
 
 def main(names: Sequence[str]) -> int:
@@ -43,6 +44,8 @@ def main(names: Sequence[str]) -> int:
                 path.unlink()
     if not names:
         _write("arithmetic", arithmetic())
+    if not names or "doors" in names:
+        _write("doors", doors())
     if not names or "interfaces" in names:
         from surface import interfaces
 
