@@ -12,7 +12,7 @@ setup: ## make .venv and build the interfaces; seconds when nothing changed
 demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 	@. ./env.sh && python -m calib_planner.ros.demo
 
-test: setup ## run every test, in as many processes as there are cores (PYTEST='-k plan' for some)
+test: setup ## run every test, in one process more than there are cores (PYTEST='-k plan' for some)
 	@. ./env.sh && unset PYTHONDONTWRITEBYTECODE && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 prove: setup ## every test with all its seeds and turns, of which make test takes a sample

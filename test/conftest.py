@@ -1,5 +1,6 @@
 """Makes ``robots`` and the tools importable from every test folder; the nodes' tests, which wait, come first."""
 
+import os
 import signal
 import sys
 import threading
@@ -16,5 +17,15 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_threa
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+LONG = ("test_docs.py", "test_golden.py", "test_robust.py", "test_campaign.py", "test_reproduction.py")
+"""Files of half a minute each: if one of them came last, one process would work on it while others are done."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than there are cores: the nodes' tests wait half of their time."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: item.path.parent.name != "ros")
+    items.sort(key=lambda item: (item.path.parent.name != "ros", item.path.name not in LONG))

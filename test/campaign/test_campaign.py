@@ -96,7 +96,7 @@ def test_same_seed_same_campaign():
 @pytest.mark.parametrize("seed", repeats([1], [0, 1, 2, 3]))
 def test_more_noise_than_stated_is_noticed_and_measured_away(seed):
     def result(sigma: float) -> CampaignResult:
-        problem = planar(60e-6, seed, budget=200, identification=TYPICAL)
+        problem = planar(repeats(90e-6, 60e-6), seed, budget=200, identification=TYPICAL)
         return campaign(problem, world_of(problem.robot, seed, sigma))
 
     plain, noisy = result(SIGMA), result(3 * SIGMA)
@@ -107,7 +107,7 @@ def test_more_noise_than_stated_is_noticed_and_measured_away(seed):
 
 def test_less_noise_than_stated_saves_measurements():
     def result(sigma: float) -> CampaignResult:
-        problem = planar(30e-6, 1, budget=200, identification=TYPICAL)
+        problem = planar(repeats(45e-6, 30e-6), 1, budget=200, identification=TYPICAL)
         return campaign(problem, world_of(problem.robot, 1, sigma))
 
     quiet, honest = result(0.3 * SIGMA), result(SIGMA)
@@ -167,7 +167,9 @@ def displaced(problem: CampaignProblem, seed: int, at: str, by: float) -> Campai
 
 
 @pytest.mark.parametrize(
-    ("identification", "budget"), [(PAPER, 40), (TYPICAL, 18), (TYPICAL, 30)], ids=["paper", "spent", "left"]
+    ("identification", "budget"),
+    repeats([(PAPER, 40), (TYPICAL, 18)], [(PAPER, 40), (TYPICAL, 18), (TYPICAL, 30)]),
+    ids=repeats(["paper", "spent"], ["paper", "spent", "left"]),
 )
 def test_a_validation_that_says_otherwise_is_believed(identification, budget):
     """60 µm required, 0.5 mm on the validation: not reached, whether or not there is budget to go on."""
@@ -182,7 +184,7 @@ def test_a_validation_that_says_otherwise_is_believed(identification, budget):
 
 def test_a_reached_campaign_says_nothing_else():
     """Outcome, message, verdict and numbers agree, whatever the robot is like."""
-    for seed in range(3):
+    for seed in range(repeats(1, 3)):
         problem = planar(80e-6, seed, budget=30, identification=TYPICAL)
         result = campaign(problem, world_of(problem.robot, seed, model=typical()))
         assert (result.outcome == "reached") == (result.verdict.level != "FAIL")
@@ -198,7 +200,7 @@ def test_a_reached_campaign_says_nothing_else():
 def test_a_validation_that_is_sound_seldom_contradicts():
     """The probability of a contradiction is that of its threshold, with errors that poses share counted once."""
     joined = []
-    for seed in range(4):
+    for seed in range(repeats(2, 4)):
         problem = planar(60e-6, seed, identification=TYPICAL)
 
         def watch(state: CampaignState) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fits import simulated, unknown, ur10e
 from numpy.typing import NDArray
-from robots import SHARED_DATA, random_configurations
+from robots import SHARED_DATA, random_configurations, repeats
 
 from calib_planner import Robot
 from calib_planner.arrays import FloatArray
@@ -70,7 +70,7 @@ def test_the_papers_model_is_plain_least_squares(sigma: float | None) -> None:
 )
 def test_what_is_predicted_is_achieved(scales: dict[str, float], heavy: bool) -> None:
     robot, ratios, inside = ur10e(2), [], []
-    for seed in range(3):
+    for seed in range(repeats(1, 3)):
         data, truth = simulated(robot, scales, 190, seed, heavy)
         found = fit_error_model(unknown(robot), data.select(np.arange(40)), typical())
         distance, ratio = fresh_errors(found, data, 40)
@@ -195,8 +195,14 @@ def spoil(how: str, points: FloatArray, rng: np.random.Generator) -> NDArray[np.
     return bad
 
 
-@pytest.mark.parametrize("how", ["random", "alike", "block", "swapped targets"])
-@pytest.mark.parametrize("scales", [{}, ALL], ids=["noise", "all"])
+WAYS = ("random", "alike", "block", "swapped targets")
+
+
+@pytest.mark.parametrize(
+    ("how", "scales"),
+    repeats([*zip(WAYS, ({}, ALL, {}, ALL), strict=True)], [(h, s) for h in WAYS for s in ({}, ALL)]),
+    ids=lambda v: v if isinstance(v, str) else "all" if v else "noise",
+)
 def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> None:
     robot = ur10e(2)
     data, _ = simulated(robot, scales, 160, 7)

@@ -27,12 +27,14 @@ class Case:
         line: The words after ``calib-planner``, quoted as in a shell; ``--json`` is added unless ``tables``.
         writes: The files it leaves, relative to its folder.
         tables: The answer is the tables for people, of which the numbers count.
+        heavy: Seconds of work for what tests of its room prove, too: compared by ``make prove``.
     """
 
     name: str
     line: str
     writes: tuple[str, ...] = ()
     tables: bool = False
+    heavy: bool = False
 
     @property
     def words(self) -> list[str]:
@@ -183,6 +185,8 @@ def needs_real(word: str) -> bool:
 # ── the command lines ────────────────────────────────────────────────────────────────────────────────
 
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
+SAMPLE = ("worst_pose", "d", "e", "o3")
+"""Criteria of which ``make test`` compares the plans, of every kind of search one; ``test_pose`` has other cases."""
 COMMANDS = (
     "init",
     "import",
@@ -215,7 +219,7 @@ def _plans() -> list[Case]:
     arm = f"plan --robot arm.urdf {ARM_POSE}"
     planar = 'plan --robot planar_2r --test-pose "0.3 0.8"'
     return [
-        *(Case(f"plan_criterion_{c}", f"{small} {two} --criterion {c}") for c in CRITERIA),
+        *(Case(f"plan_criterion_{c}", f"{small} {two} --criterion {c}", heavy=c not in SAMPLE) for c in CRITERIA),
         Case("plan", f"{kuka} --configurations 4 --repetitions 3 --starts 6 --output p.yaml", ("p.yaml",)),
         Case("plan_tables", f"{kuka} --configurations 4 --starts 2", tables=True),
         Case(
@@ -357,6 +361,7 @@ def _others() -> list[Case]:
             "campaign_transmission",
             f"{campaign} --simulate 2 --budget 16 --batch 5 --validation 4 "
             "--simulate-transmission 1e-4 --simulate-sigma 2e-5 --minimum 5",
+            heavy=True,
         ),
         Case("campaign_first", f"{campaign} --next n.csv", ("n.csv",)),
         Case("campaign_goes_on", f"{by_hand} --measured kuka_new.csv --next n.csv", ("n.csv",)),
@@ -409,6 +414,7 @@ def _others() -> list[Case]:
             "reproduce",
             "reproduce --random 100 --calibrations 10 --output r",
             ("r/tables.json", "r/index.html", "r/figure_2.svg", "r/figure_5.png"),
+            heavy=True,
         ),
     ]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cases import CASES, REAL, Case
 from golden import COARSE, EXACT, EXPECTED, SEARCHED, Inputs, Tolerance, answer, changes, differences, kept
+from robots import repeats
 
 MOST_SHOWN = 20
 
@@ -16,7 +17,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     return Inputs(tmp_path_factory.mktemp("inputs"))
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
+@pytest.mark.parametrize("case", repeats([c for c in CASES if not c.heavy], CASES), ids=lambda c: c.name)
 def test_users_get_the_same(case: Case, inputs: Inputs, tmp_path: Path) -> None:
     if case.real and not REAL.is_dir():
         pytest.skip(f"no measured data in {REAL}")

@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 from cells import SIGMA, bare
-from robots import CASES, mixed, random_configurations
+from robots import CASES, mixed, random_configurations, repeats
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.error_model import ErrorModel, Prior, typical_prior
@@ -264,8 +264,14 @@ def nulls(value, path: str = "") -> set[str]:
     return {path} if value is None else set()
 
 
-@pytest.mark.parametrize("model", ["paper", "typical", "prior"])
-@pytest.mark.parametrize("sigma", [SIGMA, None], ids=["known", "unknown"])
+@pytest.mark.parametrize(
+    ("model", "sigma"),
+    repeats(
+        [("paper", SIGMA), ("typical", None), ("prior", SIGMA)],
+        [(m, s) for m in ("paper", "typical", "prior") for s in (SIGMA, None)],
+    ),
+    ids=lambda v: v if isinstance(v, str) else "unknown" if v is None else "known",
+)
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_degenerate_sets_give_a_verdict_or_a_typed_error(name, sigma, model):
     make, data, words = DEGENERATE[name]

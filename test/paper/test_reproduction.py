@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from robots import repeats
 
 from calib_planner import Robot
 from calib_planner.cli import main
@@ -23,7 +24,7 @@ from calib_planner_paper.drawing import draw_figure_5, draw_two_link_figure, tit
 from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, number, publish, reproduce
 from calib_planner_paper.two_link import FIGURE_2, two_link_figure
 
-SETTINGS = ReproductionSettings(random_plans=2000, calibrations=100, seed=1)
+SETTINGS = ReproductionSettings(random_plans=2000, calibrations=repeats(40, 100), seed=1)
 ERRORS = 4.5
 """Standard errors within which what is random has to be."""
 
@@ -355,6 +356,7 @@ def test_command(
 
     monkeypatch.setattr(command, "reproduce", done)
     words = ["reproduce", "--output", str(tmp_path / "a"), "--seed", "1", "--random", "2000"]
+    words += ["--calibrations", str(SETTINGS.calibrations)]
     assert main([*words, "--json"]) == 0
     out = capsys.readouterr().out
     assert json.loads(out) == json.loads((folder / "tables.json").read_text(encoding="utf-8"))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import CASES, mixed
+from robots import CASES, mixed, repeats
 
 from calib_planner import Plan, PlanProblem, Robot, plan
 from calib_planner.arrays import FloatArray
@@ -40,7 +40,7 @@ def threads(_: Path) -> Iterator[Executor]:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Executor]:
-    """A dask scheduler and two worker processes on this machine, talking TCP."""
+    """A dask scheduler and two worker processes on this machine, talking TCP; docs/scaling.md has one, too."""
     dask = pytest.importorskip("dask")
     distributed = pytest.importorskip("distributed")
     with (
@@ -73,7 +73,7 @@ def alone() -> tuple[list[Plan], FloatArray]:
     return everything(None)
 
 
-@pytest.mark.parametrize("workers", [threads, processes, cluster])
+@pytest.mark.parametrize("workers", repeats([threads, processes], [threads, processes, cluster]))
 def test_same_seed_same_plan_whatever_the_executor(workers, alone, tmp_path):
     with workers(tmp_path) as executor:
         plans, random = everything(executor)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -44,15 +45,18 @@ def kuka(
     return problem, identify(problem)
 
 
+@cache
 def clean() -> Case:
     problem, estimate = kuka(16, repetitions=2, required_accuracy=2e-4)
     return problem, validate(problem, estimate, [kuka(5)[0].data])
 
 
+@cache
 def outliers() -> Case:
     return kuka(60, gross=3, unknown=("base", "tool"), loss="robust")
 
 
+@cache
 def too_few() -> Case:
     problem, _ = kuka(3)
     data = replace(problem.data, std=None)
@@ -60,6 +64,7 @@ def too_few() -> Case:
     return problem, identify(problem)
 
 
+@cache
 def several_targets() -> Case:
     robot = mixed().with_parameters("lengths+offsets")
     data = SimulatedCell(robot, random_deviations(robot, 4), 3e-5).measure(
@@ -71,6 +76,7 @@ def several_targets() -> Case:
     return problem, identify(problem)
 
 
+@cache
 def hostile() -> tuple[Case, Provenance]:
     """Names that would run a script or end an element if they were taken as HTML."""
     evil = "</script><img src=x onerror=boom()>\"'&"

@@ -12,6 +12,7 @@ import pytest
 from browser import Browser, Tab, browser
 from calibration_cases import CASES, Case, hostile, kuka, outliers
 
+from calib_planner.error_model import ErrorModel
 from calib_planner.report import write_report
 
 ALL = {**CASES, "hostile": lambda: hostile()[0]}
@@ -272,7 +273,7 @@ def test_without_javascript_there_is_a_drawing(chromium: Browser, page: Path) ->
 
 
 def test_three_thousand_points_are_drawn(chromium: Browser, tmp_path: Path) -> None:
-    write_report(tmp_path / "report.html", *kuka(3000))
+    write_report(tmp_path / "report.html", *kuka(3000, error_model=ErrorModel.paper()))
     tab = chromium.open(tmp_path / "report.html")
     assert tab.run(HELP + "return [canvas.dataset.points, canvas.dataset.arrows];") == ["3000", "400"]
     assert tab.problems == []

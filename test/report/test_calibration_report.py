@@ -224,7 +224,7 @@ def test_two_hundred_configurations_stay_below_a_megabyte() -> None:
 
 
 def test_many_rows_thin_the_drawing_and_say_so_but_never_the_numbers() -> None:
-    problem, estimate = kuka(1500, gross=4, loss="robust")
+    problem, estimate = kuka(1500, gross=4, loss="robust", error_model=ErrorModel.paper())
     report = calibration_report(problem, estimate)
     page = Page(report_page(report))
     assert len(page.json["distances_after"]) == len(page.json["scene"]["points"]) == 1500
