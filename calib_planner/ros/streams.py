@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -34,6 +35,8 @@ LOOK_PERIOD = 0.2
 """Time between two looks at the publishers of points [s]: that much of their beginning may be missed."""
 STATE_IN = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
 """States of a tracker that are not latched, reliable or not."""
+NO_EVENTS = SubscriptionEventCallbacks(incompatible_qos=lambda _: None)
+"""Of a subscription that is meant for some publishers only: others are heard by another one."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,8 @@ class DriverStreams:
         for k, topic in enumerate(topics.states):
             told = partial(self._on_state, k)
             node.create_subscription(Bool, topic, told, STATE_IN)
-            node.create_subscription(Bool, topic, told, LATCHED, qos_overriding_options=overridable("latched"))
+            options = {"qos_overriding_options": overridable("latched"), "event_callbacks": NO_EVENTS}
+            node.create_subscription(Bool, topic, told, LATCHED, **options)
         self._stated = kind
         node.create_steady_timer(LOOK_PERIOD, self.look)
 

@@ -254,7 +254,7 @@ def test_points_while_the_tracker_has_lost_the_target_do_not_count(
     state.publish(Bool(data=False))
     bench.wait(lambda: shift.node._intake._lost == [True])
     refused = shift.rest(planned.configurations[1], 3.2)
-    assert refused.status != Measurement.ACCEPTED and "lost target 1" in refused.reason
+    assert refused.status == Measurement.REJECTED_TARGET_LOST and "lost target 1" in refused.reason
     bench.wait(lambda: "lost the target" in stream_status(heard, "tracker/point").message)
     state.publish(Bool(data=True))
     bench.wait(lambda: shift.node._intake._lost == [False])
