@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache, partial
@@ -39,7 +40,7 @@ from calib_planner.report import (
     visits_scene,
 )
 from calib_planner.robot import Robot
-from calib_planner.units import counted, cut, joint_factor, joint_unit, milli, signed
+from calib_planner.units import cut, joint_factor, joint_unit, milli, signed
 
 MOST_VISITS, MOST_AHEAD, MOST_TARGETS = 2000, 300, 20
 """Measurements, configurations ahead, and targets of one measurement that the page keeps: the newest."""
@@ -82,6 +83,7 @@ class Visit(NamedTuple):
         validation: Whether it was measured for validation.
         unused: Targets whose points are not used, from 0.
         reason: Why it was rejected, or targets are not used.
+        campaign: Name of the campaign that it is part of; empty if of none.
     """
 
     number: int
@@ -91,6 +93,7 @@ class Visit(NamedTuple):
     validation: bool
     unused: tuple[int, ...]
     reason: str
+    campaign: str
 
 
 class Stream(NamedTuple):
@@ -108,12 +111,6 @@ class Line(NamedTuple):
     time: float
     kind: str
     text: str
-
-
-class Motion(NamedTuple):
-    """What the executor does: a constant of ``ExecutePlan.Feedback``."""
-
-    phase: int
 
 
 @dataclass(frozen=True)
@@ -179,12 +176,12 @@ class PageState:
         robot: The robot, as its description says.
         residuals: (number of the visit, target from 0) → measured − estimated [m], and whether it is used.
         history: (measurements, predicted accuracy [m]) of each estimate.
-        joints: Where the robot is now [rad | m], in the order of ``robot.joint_names``; empty before it is heard.
+        phase: What the executor does, a constant of ``ExecutePlan.Feedback``; ``None`` if it is silent.
+        joints: Where the robot is now [rad | m], in the robot's order; empty before it is heard.
         there: Names of services that are offered, and of nodes that are there.
         names: Part (``campaign``, ``identifier``, ``executor``) → name of its node.
         waiting: Buttons whose answer has not come.
         report: Name of the newest report that the page can show.
-        folder: Whether the page may show reports at all.
     """
 
     robot: Robot | None = None
@@ -194,7 +191,7 @@ class PageState:
     visits: Mapping[int, Visit] = field(default_factory=dict)
     history: tuple[tuple[int, float], ...] = ()
     streams: tuple[Stream, ...] = ()
-    motion: Motion | None = None
+    phase: int | None = None
     joints: tuple[float, ...] = ()
     there: frozenset[str] = frozenset()
     names: Mapping[str, str] = field(default_factory=dict)
@@ -235,8 +232,11 @@ def on_status(state: PageState, message: CampaignStatus) -> PageState:
     )
     before = state.campaign
     state = replace(state, campaign=campaign)
-    if before is not None and before.id and campaign.id and before.id != campaign.id:
-        state = replace(state, visits={}, residuals={}, history=(), report="")
+    if campaign.id and (before is None or before.id != campaign.id):
+        mine = {number: visit for number, visit in state.visits.items() if visit.campaign == campaign.id}
+        state = replace(state, visits=mine)
+    if before is not None and campaign.id and before.id != campaign.id:
+        state = replace(state, residuals={}, history=(), report="")
     return state
 
 
@@ -280,7 +280,7 @@ def on_estimate(state: PageState, message: CalibrationEstimate) -> PageState:
 
 
 def on_measurement(state: PageState, message: Measurement) -> PageState:
-    """A standstill, or what became of one that was heard before.
+    """A standstill, or what became of one that was heard before; those of other campaigns are passed over.
 
     Raises:
         InputError: Joints or points do not fit.
@@ -294,7 +294,10 @@ def on_measurement(state: PageState, message: Measurement) -> PageState:
         validation=message.purpose == Plan.VALIDATION,
         unused=tuple(int(t) for t in message.unused_targets[:MOST_TARGETS]),
         reason=cut(message.reason, LONGEST),
+        campaign=cut(message.campaign_id, LONGEST),
     )
+    if visit.campaign and state.campaign is not None and visit.campaign != state.campaign.id:
+        return state
     if not visit.number:
         return told(state, "bad", f"A standstill was not accepted: {visit.reason}") if visit.reason else state
     visits = {**state.visits, visit.number: visit}
@@ -335,8 +338,8 @@ def on_diagnostics(state: PageState, message: DiagnosticArray) -> PageState:
 
 def on_feedback(state: PageState, message: ExecutePlan.Feedback | None) -> PageState:
     """What the executor does; ``None``: it has been silent."""
-    motion = None if message is None else Motion(int(message.phase))
-    return state if motion == state.motion else replace(state, motion=motion)
+    phase = None if message is None else int(message.phase)
+    return state if phase == state.phase else replace(state, phase=phase)
 
 
 def told(state: PageState, kind: str, text: str, time: float = 0.0) -> PageState:
@@ -414,8 +417,7 @@ def _no_skip(state: PageState) -> str:
 
 
 def _no_confirm(state: PageState) -> str:
-    waits = state.motion is not None and state.motion.phase == F.CONFIRMING
-    return "" if waits else "The robot waits for no confirmation."
+    return "" if state.phase == F.CONFIRMING else "The robot waits for no confirmation."
 
 
 def _no_undo(state: PageState) -> str:
@@ -528,21 +530,26 @@ def _now(state: PageState) -> dict[str, Any]:
         }
         return gone | {"reason": text or "Start it: the page waits for it."}
     kind, word = KINDS.get(campaign.state, ("idle", "unknown"))
+    reason = SERVICE.sub(_pressed, campaign.reason)
     done = campaign.measured + campaign.validated
     total = done + campaign.left + max(campaign.validation - campaign.validated, 0)
     title, number = "", campaign.number
     if campaign.state == S.PLANNING:
         title = "The next configurations are being planned."
     elif campaign.state in (S.MEASURING, S.VALIDATING):
-        phase = F.MOVING if state.motion is None else state.motion.phase
+        phase = F.MOVING if state.phase is None else state.phase
         title = PHASES.get(phase, PHASES[F.MOVING]).format(number)
         word = "confirm" if phase == F.CONFIRMING else word
     elif campaign.state == S.WAITING:
         title = "The campaign waits, and goes on by itself."
     elif campaign.state == S.PAUSED:
         title = "Paused: the robot is sent nowhere until you press Resume."
-        if not done and campaign.ahead:
+        if not done and campaign.round and campaign.ahead:
             word, title = "review", "Look at the planned configurations, then press Resume."
+            reason = "Choose one to see it. Leave out or replace what the robot should not do."
+        elif not done and campaign.round:
+            word, title = "review", "Paused. Configurations are planned anew, and come here."
+            reason = "Wait for them, or press Resume and go on without a look."
     elif campaign.state == S.DONE:
         title = OUTCOMES.get(campaign.outcome, OUTCOMES[S.OUTCOME_OPEN])
     else:
@@ -553,8 +560,7 @@ def _now(state: PageState) -> dict[str, Any]:
         text = f"{done} measured" if ended else f"visit {min(done + 1, total)} of about {total}"
         text = f"about {total} visits" if campaign.state == S.PAUSED and not done else text
         count = {"done": done, "total": done if ended else total, "count": text}
-    reason = _sentence(SERVICE.sub(_pressed, campaign.reason))
-    return {"kind": kind, "word": word, "title": title, "reason": reason, **count}
+    return {"kind": kind, "word": word, "title": title, "reason": _sentence(reason), **count}
 
 
 SERVICE = re.compile(r"(?:\bcall )?~/([a-z_]+)")
@@ -572,8 +578,7 @@ def _posture(state: PageState) -> dict[str, Any] | None:
     campaign, robot = state.campaign, state.robot
     if campaign is None or robot is None or campaign.joint_names != robot.joint_names:
         return None
-    rows = [Ahead(campaign.number, campaign.q)] if campaign.q else []
-    rows += [a for a in campaign.ahead if not (rows and a.number == rows[0].number)]
+    rows = [a for a, _ in _coming(campaign)]
     if not rows:
         return None
     drawing = posture_drawings(robot, np.array([a.q for a in rows]))[0]
@@ -622,7 +627,7 @@ def _numbers(state: PageState) -> list[dict[str, str]]:
     count = f"{campaign.validated} of {campaign.validation} measured"
     rows.append(("validation, rms", checked, count if checked == UNKNOWN else predicted, ""))
     if campaign.excluded:
-        rows.append(("left out", counted(campaign.excluded, "configuration"), "with what is near them", ""))
+        rows.append(("left out", f"{campaign.excluded}", "configurations, and what is near", ""))
     return [dict(zip(("label", "value", "remark", "kind"), row, strict=True)) for row in rows]
 
 
@@ -652,13 +657,24 @@ def _visits(state: PageState) -> dict[str, Any]:
     campaign, robot = state.campaign, state.robot
     fits = robot is not None and campaign is not None and campaign.joint_names == robot.joint_names
     ahead: list[dict[str, Any]] = []
-    if campaign is not None and robot is not None and fits and _now(state)["kind"] != "gone":
-        row = len(state.visits)
-        for i, a in enumerate(campaign.ahead):
-            ahead.append({"number": a.number, "row": row + i, "joints": _shown(robot, a.q)})
+    if campaign is not None and robot is not None and fits:
+        for row, (a, note) in enumerate(_coming(campaign), len(state.visits)):
+            key = f"ahead {a.number}"
+            here = {"key": key, "row": row, "number": a.number, "note": note, "joints": _shown(robot, a.q)}
+            ahead.append(here)
     done = [_measured(state, row, visit) for row, visit in enumerate(state.visits.values())]
     refused = refusal(state, "skip_configuration")
     return {"ahead": ahead, "done": done[: -MOST_ROWS - 1 : -1], "measured": len(done), "refused": refused}
+
+
+def _coming(campaign: Campaign) -> list[tuple[Ahead, str]]:
+    """The configuration that is being measured (``now``), then those ahead, each once, with how often."""
+    times = Counter(a.number for a in campaign.ahead)
+    coming = {a.number: (a, f"{times[a.number]} times" if times[a.number] > 1 else "") for a in campaign.ahead}
+    if not campaign.q:
+        return list(coming.values())
+    coming.pop(campaign.number, None)
+    return [(Ahead(campaign.number, campaign.q), "now"), *coming.values()]
 
 
 def _measured(state: PageState, row: int, visit: Visit) -> dict[str, Any]:
@@ -668,6 +684,7 @@ def _measured(state: PageState, row: int, visit: Visit) -> dict[str, Any]:
     known = robot is not None and len(visit.q) == len(robot.joint_names)
     word = FATES.get(visit.status, "rejected")
     return {
+        "key": f"measured {visit.number}",
         "number": visit.number,
         "row": row,
         "joints": _shown(robot, visit.q) if robot is not None and known else [],
@@ -710,7 +727,7 @@ def _scene(state: PageState) -> dict[str, Any] | None:
     joints = len(robot.joint_names)
     fits = campaign is not None and campaign.joint_names == robot.joint_names
     visits = list(state.visits.values())
-    ahead = campaign.ahead if campaign is not None and fits else ()
+    ahead = [a for a, _ in _coming(campaign)] if campaign is not None and fits else []
     middle = tuple(robot.joint_limits.mean(axis=1).tolist())
     q = np.array([v.q if len(v.q) == joints else middle for v in visits] + [a.q for a in ahead]).reshape(
         -1, joints
@@ -826,8 +843,8 @@ def _journal(state: PageState) -> list[dict[str, Any]]:
 
 SECTIONS: dict[str, tuple[Callable[[PageState], Any], tuple[str, ...]]] = {
     "page": (_page, ("campaign", "robot", "report")),
-    "now": (_now, ("campaign", "motion", "there", "names")),
-    "buttons": (_buttons, ("campaign", "motion", "visits", "estimate", "there", "names", "waiting")),
+    "now": (_now, ("campaign", "phase", "there", "names")),
+    "buttons": (_buttons, ("campaign", "phase", "visits", "estimate", "there", "names", "waiting")),
     "posture": (_posture, ("campaign", "robot")),
     "numbers": (_numbers, ("campaign", "estimate")),
     "accuracy": (_accuracy, ("campaign", "history")),

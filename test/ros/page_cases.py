@@ -59,7 +59,7 @@ class Script:
             campaign_id="c0ffee12",
             robot=self.robot.name,
             state=state,
-            round=len(rounds),
+            round=1 + len(rounds),
             measured=min(done, COUNT - 4),
             left=max(COUNT - 4 - done, 0),
             budget=40,
@@ -217,4 +217,4 @@ class Script:
         if kind == "confirm":
             feedback.phase = feedback.CONFIRMING
             return ps.on_feedback(state, feedback)
-        return replace(state, there=frozenset(), motion=None) if kind == "gone" else state
+        return replace(state, there=frozenset(), phase=None) if kind == "gone" else state

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
 from browser import Browser, Tab, browser
 
 from calib_planner.ros.nodes.page import PageNode
-from calib_planner.ros.parameters import EVENTS, LATCHED, SENSOR_OUT
+from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED, SENSOR_OUT
 
 S = CampaignStatus
 
@@ -43,7 +43,7 @@ class Others(Node):
         self.status = self.create_publisher(S, f"{campaign}/status", LATCHED)
         self.estimate = self.create_publisher(CalibrationEstimate, f"{identifier}/estimate", LATCHED)
         self.residuals = self.create_publisher(Residuals, f"{identifier}/residuals", LATCHED)
-        self.measurements = self.create_publisher(Measurement, f"{identifier}/measurements", EVENTS)
+        self.measurements = self.create_publisher(Measurement, f"{identifier}/measurements", HISTORY)
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
         self.joints = self.create_publisher(JointState, "joint_states", SENSOR_OUT)
         kind = ExecutePlan.Impl.FeedbackMessage
@@ -181,6 +181,16 @@ def test_reports_of_the_folder_are_shown_in_a_sandbox(bench: Bench, others: Othe
     page._report_of(f"report written to {tmp_path}/report_a-fit.html")
     assert page._report_of(f"report written to {tmp_path}/report_a-fit.html") == "report_a-fit.html"
     assert not page._report_of("report written to /elsewhere/report_c.html")
+
+
+def test_a_page_that_comes_late_knows_what_was_measured(bench: Bench, others: Others, script: Script) -> None:
+    for i in range(5):
+        others.measurements.publish(script.measurement(i))
+    others.measurements.publish(script.measurement(5, campaign_id="another"))
+    others.status.publish(script.status(S.MEASURING, 5))
+    page = bench.start(PageNode, port=0)
+    bench.wait(lambda: len(page._state.visits) == 5 and page._state.campaign is not None)
+    bench.wait(lambda: page._state.robot is not None and page._state.robot.name == script.robot.name)
 
 
 # ── with a browser ───────────────────────────────────────────────────────────────────────────────────

@@ -80,12 +80,13 @@ def test_every_section_names_the_fields_that_it_reads(script: Script) -> None:
 @pytest.mark.parametrize(
     ("state", "done", "phase", "word", "title"),
     [(S.IDLE, 0, None, "ready", "Nothing is under way"), (S.PLANNING, 6, None, "planning", "being planned"),
-     (S.PAUSED, 0, None, "review", "then press Resume"), (S.PAUSED, 5, None, "paused", "until you press Resume"),
+     (S.PAUSED, 0, None, "review", "then press Resume"),
+     (S.PAUSED, 5, None, "paused", "until you press Resume"),
      (S.MEASURING, 5, 0, "measuring", "moves to configuration 5"),
      (S.MEASURING, 5, 1, "measuring", "stands still at configuration 5"),
      (S.MEASURING, 5, 2, "confirm", "waits until you confirm the move to configuration 5"),
      (S.MEASURING, 5, 3, "measuring", "The way to configuration 5"),
-     (S.VALIDATING, 13, 1, "validating", "configuration 13"), (S.WAITING, 5, None, "waiting", "goes on by itself"),
+     (S.VALIDATING, 13, 1, "validating", "configuration 13"), (S.WAITING, 5, None, "waiting", "by itself"),
      (S.DONE, COUNT, None, "done", "Done")],
 )  # fmt: skip
 def test_it_says_what_happens(
@@ -195,12 +196,23 @@ def test_rows_of_the_list_are_those_of_the_scene(script: Script) -> None:
     shown = sections(script.state("running"))
     assert [r["row"] for r in shown["visits"]["ahead"]] == shown["scene"]["ahead"] == list(range(9, 15))
     assert [r["number"] for r in shown["visits"]["ahead"]] == list(range(9, 15))
+    assert [r["note"] for r in shown["visits"]["ahead"]] == ["now", "", "", "", "", ""]
     assert [r["row"] for r in shown["visits"]["done"]] == list(range(9))[::-1]
     words = {r["number"]: (r["word"], r["kind"]) for r in shown["visits"]["done"]}
     assert words[4] == ("outlier", "bad") and words[1] == ("used", "good")
     np.testing.assert_allclose(np.array(shown["scene"]["q"])[9:], script.q[9:15], atol=1e-5)
     validation = sections(script.state("done"))["visits"]["done"][0]
     assert validation["word"] == "validation"
+
+
+def test_a_configuration_that_is_measured_several_times_is_one_row(script: Script) -> None:
+    numbers = [7, 8, 9, 8, 8]
+    rows = [script.joints(i) for i in numbers]
+    state = ps.on_status(
+        script.state("running"), script.status(S.PAUSED, 6, ahead=numbers, ahead_configurations=rows)
+    )
+    ahead = sections(state)["visits"]["ahead"]
+    assert [(r["number"], r["note"]) for r in ahead] == [(7, ""), (8, "3 times"), (9, "")]
 
 
 def test_before_an_estimate_no_point_is_drawn(script: Script) -> None:

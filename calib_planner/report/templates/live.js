@@ -142,7 +142,9 @@
     const name = element("button", "name", `${row.number}`);
     name.type = "button";
     name.setAttribute("aria-label", `show configuration ${row.number}`);
-    const item = element("li", "", name, element("span", "what", values(row.joints)));
+    const what = element("span", "what", ...(row.note ? [element("b", "", row.note), " "] : []), values(row.joints));
+    const item = element("li", "", name, what);
+    if (row.note === "now") return chosenBy(item, row);
     const acts = element("span", "acts");
     item.append(acts);
     for (const [label, replace] of [["Leave out", false], ["Replace", true]]) {
@@ -170,7 +172,7 @@
   }
 
   function chosenBy(item, row) {
-    item.dataset.row = row.row;
+    item.dataset.key = row.key;
     item.addEventListener("click", () => {
       if (!view) return;
       const robot = view.scene.robot_rows.indexOf(row.row);
@@ -183,37 +185,42 @@
   // ── the 3-D view ──────────────────────────────────────────────────────────────────────────────────
 
   const canvas = byId("canvas-3d");
-  let view = null;
-  const controls = sceneControls(canvas, () => view, choose);
+  let view = null, chosenKey = ""; // of a row that a person has chosen; else what is measured now or first is shown
+  const controls = sceneControls(canvas, () => view, () => {
+    const row = rowShown();
+    if (row && row.key !== (rowChosen() || {}).key) chosenKey = row.key;
+    choose();
+  });
 
   function takeScene(scene) {
     byId("nothing-3d").hidden = Boolean(scene);
     if (!scene) return;
-    const before = view && view.state, chosen = before ? chosenRow() : undefined;
+    const before = view && view.state;
     scene.now = data.here || null;
     view = sceneView(scene);
     if (before) Object.assign(view.state, { yaw: before.yaw, pitch: before.pitch, zoom: before.zoom });
-    const robot = scene.robot_rows.indexOf(chosen === undefined ? scene.ahead[0] : chosen);
-    Object.assign(view.state, { robot: robot, point: -1, factor: view.FACTORS[view.usualFactor()] });
+    const row = rowChosen(), robot = row ? scene.robot_rows.indexOf(row.row) : -1;
+    Object.assign(view.state, { robot: robot, point: row ? scene.rows.indexOf(row.row) : -1, factor: view.FACTORS[view.usualFactor()] });
     choose();
     controls.redraw();
   }
 
-  function chosenRow() {
+  const rows = () => (data.visits ? [...data.visits.ahead, ...data.visits.done] : []);
+  const rowChosen = () => rows().find((r) => r.key === chosenKey) || (data.visits && data.visits.ahead[0]);
+
+  function rowShown() {
     const { scene, state } = view;
-    return state.point >= 0 ? scene.rows[state.point] : scene.robot_rows[state.robot];
+    const shown = state.point >= 0 ? scene.rows[state.point] : scene.robot_rows[state.robot];
+    return rows().find((r) => r.row === shown);
   }
 
   function choose() { // marks the chosen row in the list, and says it in words
-    const row = view ? chosenRow() : undefined, visits = data.visits;
-    for (const item of document.querySelectorAll(".list li")) item.classList.toggle("chosen", row !== undefined && item.dataset.row === String(row));
-    if (!visits || row === undefined) {
-      byId("readout-3d").textContent = "";
-      return;
-    }
-    const ahead = visits.ahead.find((r) => r.row === row), done = visits.done.find((r) => r.row === row);
-    if (ahead) byId("readout-3d").textContent = `Configuration ${ahead.number}, ahead: ${words(ahead.joints)}.`;
-    if (done) byId("readout-3d").textContent = `Measurement ${done.number}, ${done.word}, residual ${done.residual}: ${words(done.joints)}. ${done.reason}`;
+    const row = view && rowShown();
+    for (const item of document.querySelectorAll(".list li")) item.classList.toggle("chosen", Boolean(row) && item.dataset.key === row.key);
+    let said = "";
+    if (row && row.word) said = `Measurement ${row.number}, ${row.word}, residual ${row.residual}: ${words(row.joints)}. ${row.reason}`;
+    else if (row) said = `Configuration ${row.number}, ${row.note || "ahead"}: ${words(row.joints)}.`;
+    byId("readout-3d").textContent = said;
   }
 
   byId("before-3d").addEventListener("click", () => view && controls.setRobot(view.state.robot - 1));

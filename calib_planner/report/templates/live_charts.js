@@ -26,7 +26,7 @@ const liveCharts = (function () {
     const y = (v) => TOP + (height - TOP - BOTTOM) * (top - Math.log10(v)) / (top - bottom);
     for (const v of ticks(bottom, top)) {
       svg.append(shape("path", { class: "grid", d: `M${LEFT} ${y(v).toFixed(1)}H${width - RIGHT}` }));
-      svg.append(shape("text", { x: LEFT - 6, y: (y(v) + 4).toFixed(1), "text-anchor": "end" }, String(Number(v.toPrecision(1)))));
+      svg.append(shape("text", { x: LEFT - 6, y: (y(v) + 4).toFixed(1), "text-anchor": "end" }, String(Number(v.toPrecision(2)))));
     }
     const step = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000].find((s) => most / s <= Math.max(2, (width - LEFT) / 60)) || 5000;
     for (let v = 0; v <= most; v += step) {
@@ -39,7 +39,7 @@ const liveCharts = (function () {
 
   function ticks(bottom, top) {
     const found = [];
-    const parts = top - bottom > 2.2 ? [1] : top - bottom > 1 ? [1, 3] : [1, 2, 5];
+    const parts = top - bottom > 2.2 ? [1] : top - bottom > 1.2 ? [1, 3] : top - bottom > 0.7 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 7];
     for (let decade = Math.floor(bottom); decade <= Math.ceil(top); decade++) {
       for (const part of parts) {
         const value = part * 10 ** decade;

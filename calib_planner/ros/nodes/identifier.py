@@ -54,7 +54,7 @@ from calib_planner.ros.messages import (
     stamp_message,
 )
 from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
-from calib_planner.ros.parameters import EVENTS, LATCHED
+from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.residuals import residuals_message, residuals_of
 from calib_planner.ros.session import Matching, Session, TooFew, condition_of
@@ -71,7 +71,7 @@ class IdentifierOutput:
         self._log = node.get_logger
         self._estimates = node.create_publisher(CalibrationEstimate, "~/estimate", LATCHED)
         self._descriptions = node.create_publisher(String, "~/robot_description", LATCHED)
-        self._measurements = node.create_publisher(Measurement, "~/measurements", EVENTS)
+        self._measurements = node.create_publisher(Measurement, "~/measurements", HISTORY)
         self._residuals = node.create_publisher(Residuals, "~/residuals", LATCHED)
         self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED)
         self._frames = StaticFrames(node) if node.settings.value.publish_transforms else None

@@ -37,7 +37,7 @@ from calib_planner.ros.lifecycle import ManagedNode, reason_of
 from calib_planner.ros.model import DEFAULT_LEVEL, TOPIC, described_model, load_shipped
 from calib_planner.ros.page_server import REPORT, Access, Answer, PageServer
 from calib_planner.ros.page_state import BUTTONS, PageState
-from calib_planner.ros.parameters import EVENTS, LATCHED, NEWEST_IN
+from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED, NEWEST_IN
 from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PageParameters
@@ -112,7 +112,7 @@ class PageNode(ManagedNode[PageParameters]):
         follow(CampaignStatus, f"{chosen.campaign}/status", page_state.on_status, LATCHED)
         follow(CalibrationEstimate, f"{chosen.identifier}/estimate", page_state.on_estimate, LATCHED)
         follow(Residuals, f"{chosen.identifier}/residuals", page_state.on_residuals, LATCHED)
-        follow(Measurement, f"{chosen.identifier}/measurements", page_state.on_measurement, EVENTS)
+        follow(Measurement, f"{chosen.identifier}/measurements", page_state.on_measurement, HISTORY)
         follow(DiagnosticArray, "/diagnostics", page_state.on_diagnostics, EVENTS)
         feedback = f"{chosen.executor}/execute_plan/_action/feedback"
         self.create_subscription(ExecutePlan.Impl.FeedbackMessage, feedback, self._on_feedback, EVENTS)
