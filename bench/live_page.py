@@ -93,7 +93,9 @@ class Graph(Node):
         return now
 
 
-async def clients(url: str, count: int, idle: int, ready: threading.Event, end: threading.Event) -> dict[str, int]:
+async def clients(
+    url: str, count: int, idle: int, ready: threading.Event, end: threading.Event
+) -> dict[str, int]:
     """Other clients until ``end``; how much those that read were told."""
     import aiohttp
 
@@ -107,7 +109,8 @@ async def clients(url: str, count: int, idle: int, ready: threading.Event, end: 
 
     async with aiohttp.ClientSession() as session:
         made = [
-            await session.ws_connect(f"{origin}/live", headers={"Origin": origin}, max_msg_size=0) for _ in range(count)
+            await session.ws_connect(f"{origin}/live", headers={"Origin": origin}, max_msg_size=0)
+            for _ in range(count)
         ]
         for client in made[:idle]:
             client._response.connection.transport.pause_reading()

@@ -26,15 +26,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
+from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.io import shipped_robots, user_path
 from calib_planner.ros import page_state
-from calib_planner.ros.cell import cell_of
 from calib_planner.ros.lifecycle import ManagedNode, reason_of
-from calib_planner.ros.model import DEFAULT_LEVEL, TOPIC, described_model, load_shipped
+from calib_planner.ros.model import DEFAULT_LEVEL, Model, ModelSource, load_shipped
 from calib_planner.ros.page_server import REPORT, Access, Answer, PageServer
 from calib_planner.ros.page_state import BUTTONS, PageState
 from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED, NEWEST_IN
@@ -85,16 +83,13 @@ class PageNode(ManagedNode[PageParameters]):
         chosen = self.settings.value
         names = {part: getattr(chosen, part) for part in ("campaign", "identifier", "executor")}
         self._state = PageState(names=names)
-        self._described = False
         self._pressed: SimpleQueue[tuple[str, Mapping[str, Any], Future[Answer]]] = SimpleQueue()
         self._calls: list[Pending] = []
         self._joints: dict[str, float] = {}
         self._heard = 0.0
-        cell = cell_of(chosen)
-        if cell is not None:
-            self._state, self._described = replace(self._state, robot=cell.load_robot()), True
-        elif chosen.robot:
-            self._state = replace(self._state, robot=load_shipped(chosen.robot, DEFAULT_LEVEL))
+        self._source = ModelSource(chosen)
+        if isinstance(self._source.model, Model):
+            self._state = replace(self._state, robot=self._source.model.robot)
         self._callers = {name: self._client_of(name) for name in BUTTONS}
         self._listen(chosen)
         self._serve(chosen)
@@ -116,8 +111,7 @@ class PageNode(ManagedNode[PageParameters]):
         follow(DiagnosticArray, "/diagnostics", page_state.on_diagnostics, EVENTS)
         feedback = f"{chosen.executor}/execute_plan/_action/feedback"
         self.create_subscription(ExecutePlan.Impl.FeedbackMessage, feedback, self._on_feedback, EVENTS)
-        if chosen.use_robot_description and not chosen.cell:
-            self.create_subscription(String, TOPIC, self._on_description, LATCHED)
+        self._source.follow(self, lambda model: self._set(replace(self._state, robot=model.robot)))
         streams = [Stream(JointState, topic, self._on_joints, lambda _: None) for topic in chosen.joint_topics]
         StreamPoller(self, streams, NEWEST_IN, DRAWN)
 
@@ -164,20 +158,10 @@ class PageNode(ManagedNode[PageParameters]):
 
     def _know_robot(self, name: str) -> None:
         """Draw the campaign's robot, if it is a shipped one and no other is told."""
-        state = self._state
-        known = state.robot is not None and (self._described or state.robot.name == name)
-        if not known and not self.settings.value.robot and name in shipped_robots():
-            self._set(replace(state, robot=load_shipped(name, DEFAULT_LEVEL)))
-
-    def _on_description(self, message: String) -> None:
-        chosen = self.settings.value
-        try:
-            model = described_model(message.data, chosen.base_link, chosen.tip_link)
-        except CalibPlannerError as error:
-            self.get_logger().error(f"{TOPIC} refused: {cut(error, 500)}", throttle_duration_sec=5.0)
-            return
-        self._described = True
-        self._set(replace(self._state, robot=model.robot))
+        robot = self._state.robot
+        told = isinstance(self._source.model, Model) or (robot is not None and robot.name == name)
+        if not told and name in shipped_robots():
+            self._set(replace(self._state, robot=load_shipped(name, DEFAULT_LEVEL)))
 
     def _on_feedback(self, message: Any) -> None:
         self._heard = time.monotonic()
