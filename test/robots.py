@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from calib_planner import Plan, Robot
 from calib_planner.io import parse_urdf
+from calib_planner.robot import Element
 
 T = TypeVar("T")
 PROVE = os.environ.get("CALIB_PLANNER_PROVE") == "1"
@@ -45,6 +47,30 @@ def repeats(sample: T, every: T) -> T:
 def mixed() -> Robot:
     """A chain with revolute, prismatic, continuous and fixed joints and an oblique axis; two targets."""
     return parse_urdf(MIXED_URDF, "mixed.urdf").with_targets([[0.1, 0.02, 0.3], [-0.05, 0.2, 0.1]])
+
+
+def random_chain(seed: int) -> Robot:
+    """A chain of 2 to 4 joints, turning and sliding about and along any axis, every amount with a parameter."""
+    rng = np.random.default_rng(seed)
+    joints = int(rng.integers(2, 5))
+    elements, limits = [], []
+    for k in range(joints):
+        slides = rng.random() < 0.3
+        kind = ("T" if slides else "R") + "xyz"[rng.integers(3)]
+        low = rng.uniform(-0.8, 0.0) if slides else rng.uniform(-4.0, 0.0)
+        limits.append([low, low + (rng.uniform(0.2, 1.0) if slides else rng.uniform(0.5, 7.0))])
+        sign = float(rng.choice([-1.0, 1.0]))
+        elements.append(Element(kind, float(rng.normal()), k, sign, f"joint{k}"))
+        link = "T" + "xyz"[rng.integers(3)]
+        elements.append(Element(link, float(rng.uniform(0.2, 1.5)), parameter=f"link{k}"))
+        if rng.random() < 0.5:
+            elements.append(Element("R" + "xyz"[rng.integers(3)], float(rng.normal()), parameter=f"turn{k}"))
+    names = [e.parameter for e in elements if e.parameter]
+    active = tuple(
+        sorted(rng.choice(names, int(rng.integers(2, len(names) + 1)), replace=False), key=names.index)
+    )
+    plain = Robot(f"random{seed}", tuple(elements), (), tuple(f"j{k}" for k in range(joints)), np.array(limits))
+    return replace(plain.with_targets(rng.normal(0.0, 0.3, (1, 3))), parameter_names=active)
 
 
 def random_configurations(robot: Robot, count: int, seed: int = 0) -> np.ndarray:

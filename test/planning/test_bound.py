@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
-from robots import mixed, random_configurations, repeats
+from robots import mixed, random_chain, random_configurations, repeats
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
 from calib_planner.error_model import Prior
@@ -28,7 +28,6 @@ from calib_planner.planning.criteria import Accuracy, Determinant, Eliminating, 
 from calib_planner.planning.information import PlanSpace
 from calib_planner.planning.search.descent import Descent
 from calib_planner.planning.search.multistart import SearchProblem, search_chunk
-from calib_planner.robot import Element
 from calib_planner.tracker import LaserTracker
 
 SLACK = 1e-9
@@ -36,30 +35,6 @@ TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 
 
 # ── random problems ──────────────────────────────────────────────────────────────────────────────────
-
-
-def random_chain(seed: int) -> Robot:
-    """A chain of 2 to 4 joints, turning and sliding about and along any axis, every amount with a parameter."""
-    rng = np.random.default_rng(seed)
-    joints = int(rng.integers(2, 5))
-    elements, limits = [], []
-    for k in range(joints):
-        slides = rng.random() < 0.3
-        kind = ("T" if slides else "R") + "xyz"[rng.integers(3)]
-        low = rng.uniform(-0.8, 0.0) if slides else rng.uniform(-4.0, 0.0)
-        limits.append([low, low + (rng.uniform(0.2, 1.0) if slides else rng.uniform(0.5, 7.0))])
-        sign = float(rng.choice([-1.0, 1.0]))
-        elements.append(Element(kind, float(rng.normal()), k, sign, f"joint{k}"))
-        link = "T" + "xyz"[rng.integers(3)]
-        elements.append(Element(link, float(rng.uniform(0.2, 1.5)), parameter=f"link{k}"))
-        if rng.random() < 0.5:
-            elements.append(Element("R" + "xyz"[rng.integers(3)], float(rng.normal()), parameter=f"turn{k}"))
-    names = [e.parameter for e in elements if e.parameter]
-    active = tuple(
-        sorted(rng.choice(names, int(rng.integers(2, len(names) + 1)), replace=False), key=names.index)
-    )
-    plain = Robot(f"random{seed}", tuple(elements), (), tuple(f"j{k}" for k in range(joints)), np.array(limits))
-    return dataclasses.replace(plain.with_targets(rng.normal(0.0, 0.3, (1, 3))), parameter_names=active)
 
 
 def random_problem(seed: int) -> PlanProblem:

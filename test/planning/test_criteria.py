@@ -62,6 +62,15 @@ def test_homogeneous(case):
     )
 
 
+def test_more_information_is_never_worse(case):
+    """Ψ(M + N) ≥ Ψ(M) for every N that is an information, and a mixture is worth at least the mean (concave)."""
+    if not case.concave:
+        pytest.skip("O2 and O4 are not information functions")
+    some, more = random_matrices(40, 11), random_matrices(40, 12)
+    one, other, both = (case.exact_values(m) for m in (some, more, some + more))
+    assert (both >= (one + other) * (1 - 1e-12)).all()
+
+
 def test_supporting_hyperplane_is_above_everywhere(case):
     """(B): Ψ(M*) ≤ tr(G M*), the inequality all bounds rest on, with the exact criterion."""
     if not case.concave:

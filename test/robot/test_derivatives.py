@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import CASES, random_configurations
+from robots import CASES, random_chain, random_configurations, repeats
 
 from calib_planner.robot.elements import rotation
 
@@ -40,6 +40,21 @@ def test_jacobian_complex_step(robot, deviations):
         axis=-1,
     )
     np.testing.assert_allclose(robot.jacobian(q, deviations), expected, atol=2e-14)
+
+
+@pytest.mark.parametrize("block", repeats(range(2), range(20)))
+def test_random_chains_complex_step(block):
+    """Columns of parameters and of joints of ten chains: joints about and along any axis, offsets anywhere."""
+    for seed in range(10 * block, 10 * block + 10):
+        robot = random_chain(seed)
+        q = random_configurations(robot, 3, seed)
+        wrong = np.random.default_rng(seed).normal(0.0, 0.1, len(robot.parameter_names))
+        for got, steps in (
+            (robot.jacobian(q, wrong), [(q + 0j, wrong + 1j * STEP * u) for u in np.eye(len(wrong))]),
+            (robot.joint_jacobian(q, wrong), [(q + 1j * STEP * u, wrong + 0j) for u in np.eye(q.shape[1])]),
+        ):
+            expected = np.stack([complex_positions(robot, *step).imag / STEP for step in steps], axis=-1)
+            np.testing.assert_allclose(got, expected, atol=1e-13 * max(1.0, np.abs(expected).max()))
 
 
 def test_jacobian_central_difference(robot, deviations):
