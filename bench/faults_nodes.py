@@ -19,14 +19,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,10 @@ BUDGET = 24
 """Measurements that a campaign may make: without faults it needs 15 to 17; one that ends badly makes them all."""
 PAIRS = 4
 """Pairs of faults, of which there are many, are looked at with so many times fewer seeds."""
+SHARE = 10
+"""Campaigns of one process: each makes a ROS context, with threads of its own."""
+PATIENCE = 300.0
+"""Time for a campaign on a busy machine [s]; with nobody else there it takes some three."""
 ONCE = 10.0
 """Simulated time after the end of a campaign, in which what is under way comes [s]."""
 
@@ -148,23 +153,50 @@ def one(fault: str, seed: int, keep: Path | None) -> Run:
         return run(fault, seed, Path(name) if keep is None else keep / f"{fault}_{seed}")
 
 
+def work() -> None:
+    """A process of its own: campaigns (fault, seed, folder) from stdin, a line of JSON for each to stdout."""
+    for line in sys.stdin:
+        fault, seed, keep = json.loads(line)
+        print(json.dumps(asdict(one(fault, seed, None if keep is None else Path(keep)))), flush=True)
+
+
+def share(tasks: list[tuple[str, int]], keep: Path | None, note: Callable[[Run], None]) -> None:
+    """Have processes make ``tasks``, one after the other; one that ends or does nothing more is replaced."""
+    left = list(tasks)
+    while left:
+        with subprocess.Popen(
+            [sys.executable, __file__, "--work"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdin is not None and process.stdout is not None
+            timer = threading.Timer(PATIENCE * len(left), process.kill)
+            timer.start()
+            where = None if keep is None else str(keep)
+            process.stdin.write("".join(json.dumps([*task, where]) + "\n" for task in left))
+            process.stdin.close()
+            for line in process.stdout:
+                note(Run(**json.loads(line)))
+                left.pop(0)
+            timer.cancel()
+        if left:
+            end, why = ("hung", "killed") if process.returncode == -9 else ("crash", f"{process.returncode}")
+            note(Run(*left.pop(0), end, why=f"its process ended: {why}"))
+
+
 def runs(names: Sequence[str], seeds: Sequence[int], jobs: int, keep: Path | None) -> dict[str, list[Run]]:
     """All of them, ``jobs`` processes at a time."""
     done: dict[str, list[Run]] = {name: [] for name in names}
-    # A fresh process for every few campaigns: each has made a ROS context with its own threads.
-    with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=10) as pool:
-        few = seeds[: -(-len(seeds) // PAIRS)]
-        wanted = [(name, seed) for seed in seeds for name in names if seed in few or "_and_" not in name]
-        futures = {pool.submit(one, name, seed, keep): (name, seed) for name, seed in wanted}
-        for future in as_completed(futures):
-            name, seed = futures[future]
-            try:
-                found = future.result()
-            except Exception as error:
-                found = Run(name, seed, "crash", why=f"{type(error).__name__}: {error}"[:1500])
-            done[name].append(found)
-            text = f"{name} {seed}: {found.end} in {found.seconds:.1f} s{'; ' * bool(found.why)}{found.why}"
-            print(text, file=sys.stderr, flush=True)
+
+    def note(found: Run) -> None:
+        done[found.fault].append(found)
+        text = f"{found.fault} {found.seed}: {found.end} in {found.seconds:.1f} s"
+        print(f"{text}{'; ' * bool(found.why)}{found.why}", file=sys.stderr, flush=True)
+
+    few = seeds[: -(-len(seeds) // PAIRS)]
+    wanted = [(name, seed) for seed in seeds for name in names if seed in few or "_and_" not in name]
+    with ThreadPoolExecutor(jobs) as pool:
+        shares = [wanted[i : i + SHARE] for i in range(0, len(wanted), SHARE)]
+        for future in [pool.submit(share, tasks, keep, note) for tasks in shares]:
+            future.result()
     return {name: sorted(found, key=lambda r: r.seed) for name, found in done.items()}
 
 
@@ -176,7 +208,11 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--keep", type=Path, help="folder for the stores")
+    parser.add_argument("--work", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.work:
+        work()
+        return 0
     if args.seeds < 1 or args.jobs < 1:
         parser.error("--seeds, --jobs: at least 1")
     began = time.monotonic()

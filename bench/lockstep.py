@@ -129,22 +129,6 @@ class Stepped:
             self._thread = Pool()
 
 
-class Quick(SingleThreadedExecutor):
-    """Without the services that nobody calls, and without the events of qualities of service."""
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context=context)
-        self._silent: dict[Any, bool] = {}
-
-    def can_execute(self, entity: Any) -> bool:
-        """Whether it may be called now."""
-        silent = self._silent.get(entity)
-        if silent is None:
-            name = getattr(entity, "srv_name", "").rpartition("/")[2]
-            silent = self._silent[entity] = name in SILENT or isinstance(entity, EventHandler)
-        return not silent and super().can_execute(entity)
-
-
 class Stage:
     """Where the nodes are.
 
@@ -160,10 +144,11 @@ class Stage:
         self.context, domain = Context(), self._kept.enter_context(own_domain())
         quiet = ["--ros-args", "--log-level", "fatal"]
         rclpy.init(args=quiet, context=self.context, domain_id=domain)
-        self._executor = Quick(context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
         self.now, self.timers, self.nodes = BEGIN, list[Timer](), dict[type, Any]()
         self.errors: list[str] = []
         self._resting: list[Resting] = []
+        self._overlooked: dict[Any, tuple[list[Any], list[Any]]] = {}
         self._back = threading.Event()
         self.client = Node("stage", context=self.context, start_parameter_services=False, enable_rosout=False)
         self._clock = self.client.create_publisher(Clock, "/clock", QoSProfile(depth=1))
@@ -176,6 +161,7 @@ class Stage:
         for kind in list(self.nodes):
             self.end(kind)
         self._executor.shutdown()
+        self._restore(self.client)
         self.client.destroy_node()
         rclpy.shutdown(context=self.context)
         self._kept.close()
@@ -191,7 +177,19 @@ class Stage:
             if node.autostarted:
                 break
         assert node.autostarted and not node.failure, node.failure
+        self._overlook(node)
         return node
+
+    def _overlook(self, node: Any) -> None:
+        """Have the executor not wait for what never comes here; the node keeps it."""
+        silent = [s for s in node._services if s.srv_name.rpartition("/")[2] in SILENT]
+        events = [w for w in node._Node__waitables if isinstance(w, EventHandler)]
+        before = self._overlooked.get(node, ([], []))
+        self._overlooked[node] = (before[0] + silent, before[1] + events)
+        for one in silent:
+            node._services.remove(one)
+        for one in events:
+            node._Node__waitables.remove(one)
 
     def end(self, kind: type) -> None:
         """End a node as its process would."""
@@ -199,8 +197,15 @@ class Stage:
         node.close()
         self.settle()
         self._executor.remove_node(node)
+        self._restore(node)
         node.destroy_node()
         self.timers = [t for t in self.timers if t.node is not node]
+
+    def _restore(self, node: Any) -> None:
+        """Give back what was overlooked, so that it is destroyed with the node."""
+        silent, events = self._overlooked.pop(node, ([], []))
+        node._services += silent
+        node._Node__waitables += events
 
     def step(self, seconds: float = STEP) -> None:
         """Time goes on, and everything is done that is to be done then."""
@@ -227,6 +232,7 @@ class Stage:
 
     def call(self, client: Any, request: Any) -> Any:
         """The answer of a service."""
+        self._overlook(self.client)
         self.settle()
         assert client.service_is_ready(), client.srv_name
         future = client.call_async(request)

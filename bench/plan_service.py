@@ -3,9 +3,10 @@
     python bench/plan_service.py [--requests 30]
 
 The node runs in a process of its own. The same request goes to its service and, by turns, to the library in this
-process, warmed up. *beside* is the time from the call to the answer less the time that the node's library call took
-(``search_time`` of the plan): conversion, validation, middleware both ways, publication. *difference* is the median
-of service less library, pair by pair, which a busy machine blurs. Milliseconds of the clock; JSON on stdout.
+process, warmed up. *beside* is the time from the call to the answer less the time that the node's library call
+took (``search_time`` of the plan): conversion, validation, middleware both ways, publication. *difference* is the
+median of service less library, pair by pair, which a busy machine blurs. Milliseconds of the clock; JSON on
+stdout.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """Soak of the identifier node: joint states and tracker points at 1 kHz each, for minutes, none may be lost.
 
     python bench/soak.py [--minutes 10] [--rate 1000] [--stored 200] [--period 3]
-        [--parameters lengths+offsets] [--unknown base,tool] [--erring 0.0001]
+        [--parameters lengths+offsets] [--unknown base,tool] [--erring 0.0001] [--targets 1]
 
 ``--parameters`` are those of a KR-270 that are identified, ``--unknown`` what else is not known beforehand:
-``full`` with ``base,tool`` are 45. ``--erring`` is the standard deviation of errors that the joints have besides
-[rad]: no geometry explains them, and a discrepancy is estimated, as on a real robot.
+``full`` with ``base,tool`` are 45. ``--targets`` up to three need the tool unknown; each is a stream.
+``--erring`` is the standard deviation of errors that the joints have besides [rad]: no geometry explains them,
+and a discrepancy is estimated, as on a real robot.
 
 The node runs in a process of its own, with a campaign of ``--stored`` configurations in its store on disk; this
 process is robot and tracker: it drives to a configuration, stands still, goes on, every ``--period`` seconds, and
@@ -59,7 +60,7 @@ from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.simulation import random_deviations
 
 ROBOT, SIGMA, MOVE = "kuka_kr270", 3e-5, 1.0
-TARGET = [[0.05, 0.02, 0.12]]
+TARGETS = [[0.05, 0.02, 0.12], [-0.06, 0.03, 0.1], [0.01, -0.08, 0.15]]
 NODE = "calibration_identifier"
 STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -93,26 +94,34 @@ class Heard:
 
     def counts(self) -> list[int]:
         """Messages per stream, joints first; empty before the node has said so."""
-        return [int(self.streams[n]["messages"]) for n in ("joint_states", "tracker/point") if n in self.streams]
+        return [int(self.streams[n]["messages"]) for n in sorted(self.streams)]
 
 
 def nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * NANO + int(stamp.nanosec)
 
 
+def topics_of(targets: int) -> list[str]:
+    """Topics of the tracker's points."""
+    return ["tracker/point"] if targets == 1 else [f"tracker/point_{k + 1}" for k in range(targets)]
+
+
 def prepare(chosen: argparse.Namespace, folder: Path, more: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """A campaign with ``stored`` measurements on disk; joints and points of ``more`` configurations to go."""
     stored, asked = chosen.stored, {"parameters": chosen.parameters, "unknown": chosen.unknown}
-    settings = IdentifierParameters(robot=ROBOT, store_folder=str(folder), sigma=SIGMA, **asked)
+    topics = tuple(topics_of(chosen.targets))
+    settings = IdentifierParameters(
+        robot=ROBOT, store_folder=str(folder), sigma=SIGMA, tracker_topics=topics, **asked
+    )
     model = first_model(settings)
     assert model is not None
     robot = Robot.load(ROBOT).with_parameters(chosen.parameters)
-    robot = robot.with_targets(TARGET) if "tool" in chosen.unknown else robot
+    robot = robot.with_targets(TARGETS[: chosen.targets]) if "tool" in chosen.unknown else robot
     real = robot.with_deviations(random_deviations(robot, 1))
     rng = np.random.default_rng(1)
     low, high = robot.joint_limits.T
     q = rng.uniform(low, high, (stored + more, len(low)))
-    points = real.positions(q + chosen.erring * rng.standard_normal(q.shape))[:, 0]
+    points = real.positions(q + chosen.erring * rng.standard_normal(q.shape))
     promised = plan(
         PlanProblem(robot.with_parameters("lengths+offsets"), [q[0]], 5, noise=SIGMA, search=Search(starts=1))
     )
@@ -123,10 +132,10 @@ def prepare(chosen: argparse.Namespace, folder: Path, more: int) -> tuple[np.nda
     how, mean = Matching(settings.plan_tolerance, False, SIGMA, 0.0, settings.most_measurements), SIGMA / 20**0.5
     began = time.time_ns() - 10 * stored * NANO
     for i in range(stored):
-        point = points[i] + mean * rng.standard_normal(3)
+        point = points[i] + mean * rng.standard_normal(points[i].shape)
         start = began + 3 * i * NANO
         stop = start + NANO // 2
-        seen = Standstill(start, stop, q[i], point[None], np.full(1, mean), np.array([20]))
+        seen = Standstill(start, stop, q[i], point, np.full(len(point), mean), np.full(len(point), 20))
         assert campaign.take(seen, how, "tracker").status == "accepted"
     store.close()
     return q[stored:], points[stored:], list(robot.joint_names)
@@ -135,18 +144,18 @@ def prepare(chosen: argparse.Namespace, folder: Path, more: int) -> tuple[np.nda
 class Cell(threading.Thread):
     """Publishes both streams at a rate and hears the node."""
 
-    def __init__(self, domain: int, names: list[str]) -> None:
+    def __init__(self, domain: int, names: list[str], targets: int) -> None:
         super().__init__(daemon=True)
         self.context, self.heard, self.names = Context(), Heard(), names
         rclpy.init(args=[], context=self.context, domain_id=domain)
         self.node = Node("soak", context=self.context)
         self._joints = self.node.create_publisher(JointState, "joint_states", STREAM)
-        self._points = self.node.create_publisher(PointStamped, "tracker/point", STREAM)
+        self._points = [self.node.create_publisher(PointStamped, t, STREAM) for t in topics_of(targets)]
         hear = self.node.create_subscription
         hear(DiagnosticArray, "/diagnostics", self.heard.diagnostics, EVENTS)
         hear(Measurement, f"{NODE}/measurements", self.heard.measurement, EVENTS)
         hear(CalibrationEstimate, f"{NODE}/estimate", self.heard.estimate, LATCHED)
-        self.sent = [0, 0]
+        self.sent = [0] * (1 + targets)
 
     def run(self) -> None:
         executor = SingleThreadedExecutor(context=self.context)
@@ -156,17 +165,17 @@ class Cell(threading.Thread):
         except ExternalShutdownException:
             return
 
-    def publish(self, stamp: int, q: np.ndarray, point: np.ndarray) -> None:
-        """One message of each stream."""
+    def publish(self, stamp: int, q: np.ndarray, points: np.ndarray) -> None:
+        """One message of each stream, with ``points`` (targets, 3)."""
         state = JointState(name=self.names, position=q.tolist())
         state.header.stamp = stamp_message(stamp)
         self._joints.publish(state)
-        seen = PointStamped()
-        seen.header.stamp, seen.header.frame_id = state.header.stamp, "tracker"
-        seen.point.x, seen.point.y, seen.point.z = point.tolist()
-        self._points.publish(seen)
-        self.sent[0] += 1
-        self.sent[1] += 1
+        for publisher, (x, y, z) in zip(self._points, points.tolist(), strict=True):
+            seen = PointStamped()
+            seen.header.stamp, seen.header.frame_id = state.header.stamp, "tracker"
+            seen.point.x, seen.point.y, seen.point.z = x, y, z
+            publisher.publish(seen)
+        self.sent = [count + 1 for count in self.sent]
 
     def settle(self) -> list[int]:
         """Counts of the node once they no longer change for three of its messages."""
@@ -211,7 +220,7 @@ def drive(
     """Publish for a time: both streams, the same stamps, messages as they become due."""
     rng, began, done, second = np.random.default_rng(2), time.time_ns(), 0, 0
     total = round(seconds * rate)
-    noise = SIGMA * rng.standard_normal((4096, 3))
+    noise = SIGMA * rng.standard_normal((4096, *points.shape[1:]))
     while done < total:
         due = min(total, int((time.time_ns() - began) * rate / NANO))
         while done < due:
@@ -237,10 +246,13 @@ def soak(chosen: argparse.Namespace, folder: Path) -> dict[str, Any]:
         given = {"robot": ROBOT, "store_folder": f"'{folder / 'store'}'", "sigma": SIGMA}
         given |= {"parameters": chosen.parameters, "unknown": f"'{chosen.unknown}'"}
         nodes.start("identifier_node", given)
-        cell = Cell(domain, names)
+        given["tracker_topics"] = f"[{', '.join(topics_of(chosen.targets))}]"
+        cell = Cell(domain, names, chosen.targets)
         cell.start()
         try:
-            while len(cell.heard.counts()) < 2 or min(cell.heard.counts()) < 3:  # until matched both ways
+            while (
+                len(cell.heard.counts()) < len(cell.sent) or min(cell.heard.counts()) < 3
+            ):  # until matched both ways
                 nodes.check()
                 cell.publish(time.time_ns(), q[0] + 0.05, points[0])
                 time.sleep(0.5)
@@ -288,10 +300,11 @@ def figures(
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Median, 95 % and largest."""
+    """Median, 95 %, 99 % and largest."""
     if not values:
         return {}
-    return {n: round(float(np.quantile(values, p)), 1) for n, p in (("median", 0.5), ("p95", 0.95), ("max", 1.0))}
+    shares = {"median": 0.5, "p95": 0.95, "p99": 0.99, "max": 1.0}
+    return {n: round(float(np.quantile(values, p)), 1) for n, p in shares.items()}
 
 
 def main() -> int:
@@ -304,6 +317,7 @@ def main() -> int:
     )
     parser.add_argument("--parameters", default="lengths+offsets", help="what is identified")
     parser.add_argument("--unknown", default="", help="base, tool, base,tool or nothing")
+    parser.add_argument("--targets", type=int, choices=range(1, 1 + len(TARGETS)), default=1, help="reflectors")
     parser.add_argument("--erring", type=float, default=0.0, help="errors of the joints' own [rad]")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
