@@ -88,7 +88,7 @@ def constraints_text(item: Field[Any]) -> str:
     if data["low"] is not None:
         words.append(f"{data['low']:g} to {data['high']:.15g}")
     if data.get("choices"):
-        words.append("one of: " + ", ".join(data["choices"]))
+        words.append("one of: " + ", ".join(filter(None, data["choices"])))
     if data.get("read_only"):
         words.append("fixed after start")
     if taken_at_configure(item):
