@@ -246,10 +246,11 @@ class IdentifiedModel:
     @cached_property
     def ends(self) -> tuple[str, str]:
         """Names of the frames of base and tip: links of the URDF, or as the parameters say."""
-        chosen = self.settings
+        chosen, cell = self.settings, cell_of(self.settings)
         if not self.urdf:
             return chosen.frame_id, chosen.tip_frame or DEFAULT_TIP
-        chain = parse_chain(self.urdf, TOPIC, chosen.base_link or None, chosen.tip_link or None)
+        links = (chosen.base_link, chosen.tip_link) if cell is None else (cell.base_link, cell.tip_link)
+        chain = parse_chain(self.urdf, self.stored.origin, *(link or None for link in links))
         return chain.base, chosen.tip_frame or chain.tip
 
     def follow(self, plan: Plan) -> Robot:

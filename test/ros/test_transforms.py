@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from calib_planner.errors import InputError
 from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.io import config_folder
 from calib_planner.measurements import Measurements
-from calib_planner.ros.model import heard_model
+from calib_planner.ros.model import first_model, heard_model
 from calib_planner.ros.parameters import LATCHED
 from calib_planner.ros.settings import IdentifierParameters
 from calib_planner.ros.transforms import OTHERS, placed_frames, transform_message
@@ -102,7 +103,7 @@ def test_names_that_give_a_frame_two_parents_are_refused(wrong: dict[str, Any]) 
         IdentifierParameters(**wrong)
 
 
-def test_frames_are_the_links_of_the_description() -> None:
+def test_frames_are_the_links_of_the_description(tmp_path: Path) -> None:
     links = "".join(f'<link name="{name}"/>' for name in ("world", "arm", "flange"))
     joints = "".join(
         f'<joint name="j{k}" type="revolute"><parent link="{a}"/><child link="{b}"/><axis xyz="0 0 1"/>'
@@ -112,6 +113,13 @@ def test_frames_are_the_links_of_the_description() -> None:
     text = f'<robot name="r">{links}{joints}</robot>'
     assert heard_model(text, IdentifierParameters()).ends == ("world", "flange")
     assert heard_model(text, IdentifierParameters(tip_frame="probe")).ends == ("world", "probe")
+    assert heard_model(text, IdentifierParameters(base_link="arm")).ends == ("arm", "flange")
+    (tmp_path / "r.urdf").write_text(text)
+    (tmp_path / "cell.yaml").write_text("robot: r.urdf\nbase-link: arm\n")
+    model = first_model(IdentifierParameters(cell=str(tmp_path / "cell.yaml"), unknown="tool"))
+    assert model is not None and model.ends == ("arm", "flange")
+    shipped = first_model(IdentifierParameters(frame_id="foot", use_robot_description=False))
+    assert shipped is not None and shipped.ends == ("foot", "tool0")
 
 
 # ── the node ─────────────────────────────────────────────────────────────────────────────────────────
