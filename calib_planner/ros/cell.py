@@ -135,7 +135,7 @@ def _said(cell: Cell, path: str) -> dict[str, Parameters]:
         settle=cell.settle,
         dwell=cell.dwell,
     )
-    controlled = own | _known(locked_topics=cell.tracker_locked, controller_action=cell.controller)
+    controlled = own | _known(tracker_state_topics=cell.tracker_locked, controller_action=cell.controller)
     return {
         "planner": measured | pace | _known(accuracy_frame=cell.accuracy_frame),
         "identifier": results

@@ -224,7 +224,7 @@ class ExecutorParameters(Watch, PaceParameters, RobotParameters):
         "calibration_planner/current_plan", "topic of the plan that ~/execute executes"
     )
     joint_topics: tuple[str, ...] = at_configure(("joint_states",), JOINT_TOPICS)
-    locked_topics: tuple[str, ...] = at_configure(
+    tracker_state_topics: tuple[str, ...] = at_configure(
         ("tracker/locked",),
         "topics std_msgs/Bool on which the tracker says whether it holds a target, one per target; a topic on "
         "which nothing was heard is not watched",
@@ -268,7 +268,7 @@ class SimulatorParameters(LifecycleParameters, Faults):
     joint_speed: float = parameter(6.0, "largest joint speed", "rad/s", 1e-3, 100.0)
     dwell: float = parameter(0.8, "length of a standstill, per measurement", "s", 0.0, 600.0)
     tracker_topics: tuple[str, ...] = at_configure(("tracker/point",), TOPICS)
-    locked_topics: tuple[str, ...] = at_configure(
+    tracker_state_topics: tuple[str, ...] = at_configure(
         ("tracker/locked",), "topics on which it says whether the tracker holds its targets"
     )
     controller_action: str = at_configure(

@@ -276,7 +276,7 @@ def test_a_campaign_in_simulation(
     points = ["tracker/point_1", "tracker/point_2"]
     assert forced["simulator"]["tracker_topics"] == forced["identifier"]["tracker_topics"] == points
     locked = ["one/locked", "two/locked"]
-    assert forced["simulator"]["locked_topics"] == forced["executor"]["locked_topics"] == locked
+    assert forced["simulator"]["tracker_state_topics"] == forced["executor"]["tracker_state_topics"] == locked
     assert forced["identifier"]["tracker_state_topics"] == locked
     for part in ("simulator", "executor"):
         assert forced[part]["controller_action"] == "arm/follow_joint_trajectory"

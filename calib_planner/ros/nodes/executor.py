@@ -127,7 +127,7 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         chosen = self.settings.value
         self._source = ModelSource(chosen)
         self._source.follow(self, self._on_model)
-        topics = [t for t in chosen.locked_topics if t]
+        topics = [t for t in chosen.tracker_state_topics if t]
         self._forget(tuple(Beam(t) for t in topics))
         joints = [Stream(JointState, t, self._on_joints, lambda _: None) for t in chosen.joint_topics]
         self._streams = StreamPoller(self, joints, STREAM_IN)

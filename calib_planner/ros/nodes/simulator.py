@@ -98,7 +98,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             self.create_publisher(PointStamped, topic, SENSOR_OUT) for topic in chosen.tracker_topics
         ]
         self._locked_publishers = [
-            self.create_publisher(Bool, topic, SENSOR_OUT) for topic in chosen.locked_topics if topic
+            self.create_publisher(Bool, topic, SENSOR_OUT) for topic in chosen.tracker_state_topics if topic
         ]
 
     def activate(self) -> None:
