@@ -186,7 +186,7 @@ def needs_real(word: str) -> bool:
 
 CRITERIA = ("test_pose", "worst_pose", "d", "d_star", "a", "e", "o1", "o2", "o3", "o4", "o5")
 SAMPLE = ("worst_pose", "d", "e", "o3")
-"""Criteria of which ``make test`` compares the plans, of every kind of search one; ``test_pose`` has other cases."""
+"""Criteria of which ``make test`` compares the plans, one of every kind of search; others have ``test_pose``."""
 COMMANDS = (
     "init",
     "import",
