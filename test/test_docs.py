@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from docs_examples import ROOT, blocks, environment, examples, expectations, run, said
-from robots import repeats
+from robots import PROVE, repeats
 from warm_commands import warm_commands
 
 from calib_planner.cli import main
@@ -46,6 +46,8 @@ def record_bag(folder: Path) -> None:
     write_bag(folder / "monday_1", campaign(cell, stops), ("/joint_states", "/leica/point"))
 
 
+LONG = ("how-many.md",)
+"""Pages whose commands other pages have, too, and whose examples take long: ``make prove`` runs them."""
 PREPARED: dict[str, Callable[[Path], None]] = {"docs/real-robot-data.md": record_bag}
 
 
@@ -57,7 +59,7 @@ def programs() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("shell", repeats(("bash",), ("bash", "zsh")))
-@pytest.mark.parametrize("page", [p for p in PAGES if examples(p)], ids=named)
+@pytest.mark.parametrize("page", [p for p in PAGES if examples(p) and (PROVE or p.name not in LONG)], ids=named)
 def test_examples_run_and_print_what_the_page_says(
     page: Path, shell: str, tmp_path: Path, programs: Path
 ) -> None:

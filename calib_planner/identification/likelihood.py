@@ -641,8 +641,10 @@ def _inverse_of(factor: FloatArray) -> FloatArray:
 
 
 def _mirrored(lower: FloatArray) -> FloatArray:
-    """The symmetric matrix of which ``lower`` holds the lower triangle."""
-    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+    """The symmetric matrix of which ``lower`` holds the lower triangle, and zeros above it."""
+    whole = np.asarray(lower + lower.T)
+    whole[np.diag_indices(len(whole))] *= 0.5
+    return whole
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

@@ -280,7 +280,7 @@ def test_targets_that_are_never_seen_use_up_the_budget_or_the_failures():
 
 
 def test_gross_errors_are_left_out():
-    problem = kuka(60e-6, 2, identification=TYPICAL)
+    problem = kuka(repeats(100e-6, 60e-6), 2, identification=TYPICAL)
     world = world_of(problem.robot, 2)
     measure = simulated(world, 2)
     count = 0

@@ -32,7 +32,7 @@ def arm(tmp_path: Path) -> tuple[Path, Path]:
     urdf, data = tmp_path / "arm.urdf", tmp_path / "arm.csv"
     urdf.write_text(MIXED_URDF)
     cell = SimulatedCell(mixed(), {"turn.offset": 0.02, "slide.x": 1e-3, "base.x": 2.0, "base.rz": 2.5})
-    write_measurements(data, cell.measure(random_configurations(mixed(), 40), 1, 2))
+    write_measurements(data, cell.measure(random_configurations(mixed(), 25), 1, 2))
     return urdf, data
 
 

@@ -200,7 +200,7 @@ WAYS = ("random", "alike", "block", "swapped targets")
 
 @pytest.mark.parametrize(
     ("how", "scales"),
-    repeats([*zip(WAYS, ({}, ALL, {}, ALL), strict=True)], [(h, s) for h in WAYS for s in ({}, ALL)]),
+    repeats([("block", {}), ("swapped targets", ALL)], [(h, s) for h in WAYS for s in ({}, ALL)]),
     ids=lambda v: v if isinstance(v, str) else "all" if v else "noise",
 )
 def test_gross_errors_lose_their_weight(how: str, scales: dict[str, float]) -> None:

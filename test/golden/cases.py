@@ -409,6 +409,7 @@ def _others() -> list[Case]:
                     "demo.png",
                 )
             ),
+            heavy=True,
         ),
         Case(
             "reproduce",

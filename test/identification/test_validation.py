@@ -129,7 +129,7 @@ def test_chance_moves_errors_as_far_as_the_degrees_of_freedom_say(held_out):
     robot = plain_cell(0)[1]
     q = random_configurations(robot, 12, 1)
     rows = np.arange(6)
-    for seed in range(repeats(120, 200)):
+    for seed in range(repeats(60, 200)):
         cell = plain_cell(seed)[0]
         data = bare(cell.measure(q, 1, seed))
         problem = IdentificationProblem(robot, data.select(rows), SIGMA, ErrorModel.paper())
