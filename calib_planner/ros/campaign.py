@@ -234,7 +234,7 @@ class Visit:
         reason: Why the identifier rejected a standstill meanwhile; empty if it rejected none.
         anywhere: Whether it was for one of ``ANYWHERE``.
         final: Whether the identifier will not judge this standstill again.
-        asked: Whether the identifier, which said nothing, was asked again.
+        told_again: Whether the plan was told again, because the identifier said nothing.
     """
 
     action: Measure
@@ -243,7 +243,7 @@ class Visit:
     reason: str = ""
     anywhere: bool = False
     final: bool = False
-    asked: bool = False
+    told_again: bool = False
 
     def next(self, phase: str, now: float) -> None:
         """Begin a phase at ``now`` [s]."""
@@ -427,10 +427,10 @@ class Measuring:
             self._wait_for(f"{name} is not there")
             visit.next("telling", self._node.seconds)
             return state
-        if not visit.reason and not visit.asked and self._plan is not None:
+        if not visit.reason and not visit.told_again and self._plan is not None:
             # It may have accepted it and was started anew since: a plan that is told again is answered with
             # what was measured.
-            visit.asked = True
+            visit.told_again = True
             self._announce(self._plan)
             visit.next("judging", self._node.seconds - max(self._settings.patience - RETRY, 0.0))
             return state
