@@ -152,7 +152,7 @@ def _said(cell: Cell, path: str) -> dict[str, Parameters]:
             budget=cell.budget,
             validation=cell.validation,
         ),
-        "executor": controlled | pace | _known(moveit_group=cell.moveit_group),
+        "executor": controlled | pace | _known(moveit_group=cell.moveit_group, joint_topics=cell.joint_topics),
         "page": own | _known(joint_topics=cell.joint_topics, report_folder=cell.store_folder),
         "simulator": controlled | _known(tracker_topics=topics, sigma=None if noise is None else noise.typical),
     }

@@ -1,6 +1,6 @@
 """What the identifier publishes on ``/diagnostics``: its streams, its session, its estimate, its store.
 
-A snapshot goes in and a message comes out. The level is ERROR where no measurement can be accepted, WARN where
+A snapshot goes in and findings come out. The level is ERROR where no measurement can be accepted, WARN where
 somebody should look, STALE where no message comes, and OK otherwise.
 """
 
@@ -9,22 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-
 from calib_planner.acquisition import NANO, Intake, Offset
 from calib_planner.campaign import VALIDATION
 from calib_planner.identification import Estimate
 from calib_planner.io import UnavailableStore
-from calib_planner.ros.messages import stamp_message
+from calib_planner.ros.lifecycle import ERROR, OK, STALE, WARN, Finding
 from calib_planner.ros.session import Session, condition_of
-from calib_planner.units import cut, milliseconds
-
-OK, WARN, ERROR, STALE = (
-    DiagnosticStatus.OK,
-    DiagnosticStatus.WARN,
-    DiagnosticStatus.ERROR,
-    DiagnosticStatus.STALE,
-)
+from calib_planner.units import milliseconds
 
 
 @dataclass(frozen=True)
@@ -78,45 +69,29 @@ def health(intake: Intake, now: int, seconds: float) -> list[StreamHealth]:
     ]
 
 
-def diagnostics(
-    name: str,
-    stamp: int,
-    streams: Sequence[StreamHealth],
-    bound: float,
-    session: Session | None,
-    waiting: str,
-) -> DiagnosticArray:
-    """The message.
+def identifier_findings(
+    streams: Sequence[StreamHealth], bound: float, session: Session | None, waiting: str
+) -> list[Finding]:
+    """What the identifier has to say.
 
     Args:
-        name: Name of the node.
-        stamp: Now [ns].
         streams: The streams, joints first.
         bound: Largest clock offset [s].
         session: The session, or ``None``.
         waiting: Why there is no session.
     """
-    robot = "" if session is None else session.robot.name
-    parts = [(f"stream {s.name}", *_stream(s, bound)) for s in streams]
+    found = [Finding(f"stream {s.name}", *_stream(s, bound)) for s in streams]
     if session is None:
-        parts.append(("campaign", ERROR, waiting, {}))
-    else:
-        parts += [
-            ("campaign", *_campaign(session)),
-            ("estimate", *_estimate(session)),
-            ("store", *_store(session)),
-        ]
-    message = DiagnosticArray()
-    message.header.stamp = stamp_message(stamp)
-    message.status = [_status(name, robot, *part) for part in parts]
-    return message
+        return [*found, Finding("campaign", ERROR, waiting)]
+    parts = (("campaign", _campaign), ("estimate", _estimate), ("store", _store))
+    return [*found, *(Finding(part, *tell(session)) for part, tell in parts)]
 
 
-Finding = tuple[bytes, str, Mapping[str, object]]
+Told = tuple[bytes, str, Mapping[str, object]]
 """Level, message and values."""
 
 
-def _stream(s: StreamHealth, bound: float) -> Finding:
+def _stream(s: StreamHealth, bound: float) -> Told:
     values = {
         "rate [Hz]": f"{s.rate:.1f}",
         "age [s]": "" if s.age is None else f"{s.age:.3f}",
@@ -140,7 +115,7 @@ def _stream(s: StreamHealth, bound: float) -> Finding:
     return OK, f"{s.rate:.0f} Hz", values
 
 
-def _campaign(session: Session) -> Finding:
+def _campaign(session: Session) -> Told:
     rejections, missing = session.rejections, session.missing()
     values: dict[str, object] = {
         "campaign": session.campaign_id,
@@ -166,7 +141,7 @@ def _campaign(session: Session) -> Finding:
     return OK, f"{len(missing)} configurations missing, next {missing[0]}", values
 
 
-def _estimate(session: Session) -> Finding:
+def _estimate(session: Session) -> Told:
     estimate = session.newest
     if not isinstance(estimate, Estimate):
         text = "no estimate yet" if estimate is None else estimate.message
@@ -190,7 +165,7 @@ def _estimate(session: Session) -> Finding:
     return level, reasons or estimate.fit.message, values
 
 
-def _store(session: Session) -> Finding:
+def _store(session: Session) -> Told:
     store = session.store
     values = {"file": "" if store.path is None else store.path, "standstills kept": len(session.records)}
     if store.trouble:
@@ -198,12 +173,3 @@ def _store(session: Session) -> Finding:
     if store.path is None and not isinstance(store, UnavailableStore):
         return WARN, "in memory only, lost with the node: set store_folder", values
     return OK, "every accepted measurement is on disk", values
-
-
-def _status(
-    name: str, robot: str, part: str, level: bytes, message: str, values: Mapping[str, object]
-) -> DiagnosticStatus:
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(
-        name=f"{name}: {part}", hardware_id=robot, level=level, message=cut(message), values=pairs
-    )

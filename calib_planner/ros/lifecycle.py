@@ -9,6 +9,9 @@ half the way, and takes QoS overrides (see ``qos``); ``undo_with`` adds other th
 With the parameter ``autostart`` (the default) the node goes to *active* as soon as it spins, so that it can be
 run without a lifecycle manager; with ``autostart: false`` a manager drives it by ``~/change_state``.
 
+Once in ``diagnostics_period`` a node says on ``/diagnostics`` whether it is active, or why not and what to do,
+and what it adds by ``findings``.
+
 An exception in a callback would end the process, whoever sent the message: here it is logged, and a service
 answers that it failed.
 """
@@ -18,11 +21,12 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -40,12 +44,45 @@ from std_srvs.srv import Trigger
 
 from calib_planner.acquisition import NANO
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
-from calib_planner.ros.parameters import QOS, REQUESTS, NodeParameters, overridable, own, parameter
+from calib_planner.ros.parameters import EVENTS, QOS, REQUESTS, NodeParameters, overridable, own, parameter
 from calib_planner.ros.rclpy_ext.lasting import LastingActionServer, lasting
 from calib_planner.ros.rclpy_ext.lifecycle import TidyLifecycleNode, given_parameters
 from calib_planner.units import cut
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+OK, WARN, ERROR, STALE = (
+    DiagnosticStatus.OK,
+    DiagnosticStatus.WARN,
+    DiagnosticStatus.ERROR,
+    DiagnosticStatus.STALE,
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a part of a node has to say on ``/diagnostics``.
+
+    Attributes:
+        part: Name of the part.
+        level: ``OK``, ``WARN``, ``ERROR`` or ``STALE``.
+        message: What is the case, and what to do.
+        values: Further values by name, with units.
+    """
+
+    part: str
+    level: bytes
+    message: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+    def status(self, node: str, robot: str) -> DiagnosticStatus:
+        """The message, of a node that works for a robot."""
+        pairs = [KeyValue(key=key, value=str(value)) for key, value in self.values.items()]
+        message = cut(self.message)
+        return DiagnosticStatus(
+            name=f"{node}: {self.part}", hardware_id=robot, level=self.level, message=message, values=pairs
+        )
+
+
 JUMP = 3600.0
 """Simulated time goes on by less between two looks; more is another bag, or the clock's first message [s]."""
 LOOK = 0.01
@@ -61,6 +98,9 @@ class LifecycleParameters:
     """The parameters that every node has; those of a node inherit from it."""
 
     autostart: bool = parameter(True, "go to active without a lifecycle manager", read_only=True)
+    diagnostics_period: float = parameter(
+        1.0, "time between two messages on /diagnostics", "s", 0.05, 3600.0, read_only=True
+    )
 
 
 class Stopwatch:
@@ -97,6 +137,8 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     Attributes:
         settings: The parameters; ``settings.value`` is the current dataclass.
         failure: Why the last transition failed; empty if it did not.
+        newest: What the newest piece of work came to.
+        diagnostics: Publisher of ``/diagnostics``.
         autostarted: Whether the node has tried to start by itself, with or without success.
 
     Raises:
@@ -118,6 +160,11 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         except Exception:
             self.destroy_node()
             raise
+        self._fault, self.newest = "", tuple[Finding, ...]()
+        self.diagnostics = super().create_publisher(
+            DiagnosticArray, "/diagnostics", own(EVENTS), qos_overriding_options=overridable()
+        )
+        self.create_steady_timer(self.settings.value.diagnostics_period, self.publish_findings)
         self._first: Timer | None = None
         if self.settings.value.autostart:
             self._first = self.create_steady_timer(0.0, self._autostart)
@@ -135,6 +182,20 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
 
     def clean_up(self) -> None:
         """Forget what ``configure`` made, besides publishers, services and so on."""
+
+    def findings(self) -> Sequence[Finding]:
+        """What the node has to say on ``/diagnostics`` while it is configured, besides its state."""
+        return self.newest
+
+    def outcome(self, part: str, level: bytes, text: str) -> None:
+        """Keep what the newest piece of work came to, for ``/diagnostics``."""
+        seconds = f"{self.now / 1e9:.1f}"
+        self.newest = (Finding(part, level, text, {"ended at [s]": seconds}),)
+
+    @property
+    def robot_name(self) -> str:
+        """The robot that the configured node works for; empty while there is none."""
+        return ""
 
     def undo_with(self, callback: Callable[..., Any], *args: Any) -> None:
         """In ``configure`` or ``activate``: call ``callback(*args)`` on the way back, the last one first."""
@@ -191,6 +252,26 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         self._ending = True
         self._leave_all()
         return True
+
+    def publish_findings(self) -> None:
+        """Say on ``/diagnostics`` how the node is."""
+        name, made = self.get_fully_qualified_name().strip("/"), bool(self._made)
+        found = [self._own_state(), *(self.findings() if made else ())]
+        robot = self.robot_name if made else ""
+        message = DiagnosticArray(status=[finding.status(name, robot) for finding in found])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.diagnostics.publish(message)
+
+    def _own_state(self) -> Finding:
+        """Whether the node is active, or why not and what to do."""
+        state, values = self.state, {"state": self.state, "newest fault in a callback": self._fault}
+        if state == "active":
+            return Finding("node", OK, state, values)
+        steps = "activate" if state == "inactive" else "configure, and activate"
+        advice = f"ros2 lifecycle set {self.get_fully_qualified_name()} {steps}"
+        if self.failure:
+            return Finding("node", ERROR, f"{state}: {self.failure}; remedy it, then: {advice}", values)
+        return Finding("node", WARN, f"{state}: {advice}", values)
 
     # ── transitions, called by rclpy ─────────────────────────────────────────────────────────────────
 
@@ -374,6 +455,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
         return safe
 
     def _say(self, error: Exception) -> None:
+        self._fault = reason_of(error)
         # Without a context the process is ending, and nothing can be logged.
         if self.context.ok():
             self.get_logger().error(reason_of(error), throttle_duration_sec=1.0)

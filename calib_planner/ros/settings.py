@@ -182,7 +182,6 @@ class IdentifierParameters(StandstillSettings, RobotParameters):
         1e-3,
         60.0,
     )
-    diagnostics_period: float = at_configure(1.0, "time between two messages on /diagnostics", "s", 0.05, 3600.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,7 +15,7 @@ from calib_planner import Estimate
 from calib_planner.acquisition import NANO, Intake, JointReader, Offset, StandstillSettings, StreamCount
 from calib_planner.errors import InputError, StoreError
 from calib_planner.io import StoredModel, UnavailableStore
-from calib_planner.ros.diagnostics import StreamHealth, diagnostics, health
+from calib_planner.ros.diagnostics import StreamHealth, health, identifier_findings
 from calib_planner.ros.messages import joints_message, point_message, stamp_message
 from calib_planner.ros.session import Session
 
@@ -24,11 +24,12 @@ POINT = replace(GOOD, name="tracker/point", skew=0.001, offset=Offset(0.004, 0.0
 
 
 def said(campaign: Session | None, *streams: StreamHealth) -> dict[str, DiagnosticStatus]:
-    message = diagnostics("identifier", 7 * NANO, streams or (GOOD, POINT), 0.1, campaign, "no robot yet")
-    assert message.header.stamp.sec == 7
-    found = {s.name.removeprefix("identifier: "): s for s in message.status}
-    assert len(found) == len(message.status)
-    return found
+    found = identifier_findings(streams or (GOOD, POINT), 0.1, campaign, "no robot yet")
+    robot = "" if campaign is None else campaign.robot.name
+    parts = {f.part: f.status("identifier", robot) for f in found}
+    assert len(found) == len(parts)
+    assert all(status.name == f"identifier: {part}" for part, status in parts.items())
+    return parts
 
 
 def values(status: DiagnosticStatus) -> dict[str, str]:

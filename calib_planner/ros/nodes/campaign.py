@@ -49,7 +49,7 @@ from calib_planner.ros.campaign import (
     with_goals,
     write_result,
 )
-from calib_planner.ros.lifecycle import ManagedNode, reason_of
+from calib_planner.ros.lifecycle import OK, WARN, Finding, ManagedNode, reason_of
 from calib_planner.ros.messages import reasons_of, stamp_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.parameters import EVENTS, LATCHED
@@ -61,6 +61,17 @@ PERIOD = 0.05
 """Time between two looks at what there is to do [s]."""
 PATIENCE = 4.0
 """Time that the search of a plan has to end when it is stopped [s]."""
+
+STATES = {
+    CampaignStatus.IDLE: "idle",
+    CampaignStatus.PLANNING: "planning",
+    CampaignStatus.MEASURING: "measuring",
+    CampaignStatus.VALIDATING: "validating",
+    CampaignStatus.WAITING: "waiting",
+    CampaignStatus.PAUSED: "paused",
+    CampaignStatus.DONE: "done",
+}
+"""State → word for people."""
 
 
 class CampaignNode(ManagedNode[CampaignParameters]):
@@ -84,6 +95,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self.campaign: CampaignState | None = None
         self._let_go()
         self._id, self._reason, self._sent = "", "call ~/start", ""
+        self._told = idle_status(self._reason)
         self._reported = self._reviewed = self._replanning = False
 
     def _let_go(self) -> None:
@@ -374,6 +386,22 @@ class CampaignNode(ManagedNode[CampaignParameters]):
                 self._reason = f"the results were not written: {error}"
                 self.get_logger().error(self._reason)
 
+    def findings(self) -> Sequence[Finding]:
+        """Where the campaign is, and what to do."""
+        told = self._told
+        done = {"measured": told.measured, "left": told.left, "validated": told.validated, "budget": told.budget}
+        fine = (CampaignStatus.OUTCOME_OPEN, CampaignStatus.OUTCOME_REACHED)
+        halted = told.state in (CampaignStatus.PAUSED, CampaignStatus.WAITING) or told.outcome not in fine
+        words = f"{STATES[told.state]}: {told.reason}" if told.reason else STATES[told.state]
+        values = {"campaign": told.campaign_id, **done}
+        return (Finding("campaign", WARN if halted else OK, words, values),)
+
+    @property
+    def robot_name(self) -> str:
+        """The campaign's robot, or the one of the next campaign."""
+        model = self._source.model
+        return str(self._told.robot) or (model.robot.name if isinstance(model, Model) else "")
+
     def _publish_status(self) -> None:
         """Publish the status if it has changed."""
         if self.campaign is None:
@@ -381,6 +409,7 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         else:
             message = status_message(self.campaign, self._id, self._measuring.waiting, self._reason)
         text = repr(message)
+        self._told = message
         if text != self._sent:
             self._sent = text
             message.header.stamp = stamp_message(self.now)

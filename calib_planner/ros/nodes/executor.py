@@ -55,7 +55,7 @@ from calib_planner.ros.execution import (
     job_of,
 )
 from calib_planner.ros.executor import ACTION, NewestPlan, check_executable, dwell_of, feedback_message
-from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.lifecycle import ERROR, OK, WARN, Finding, ManagedNode
 from calib_planner.ros.messages import nanoseconds, plan_from_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
 from calib_planner.ros.parameters import STREAM_IN
@@ -183,6 +183,26 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         if stands:
             self._finish(run, Outcome("ABORTED", f"{words}; the robot stands"))
         self._finish(run, Outcome("ABORTED", f"{words}; THE ROBOT WAS NOT SEEN TO STAND: look at it", alarm=True))
+
+    def findings(self) -> Sequence[Finding]:
+        """Whether there is a controller, what is being done, and what came of the newest plan."""
+        run, name = self._run, self.settings.value.controller_action
+        controller = Finding("controller", OK, f"{name} is there")
+        if self._arm is None:
+            controller = Finding("controller", ERROR, NO_CONTROL)
+        elif not self._arm.server_is_ready():
+            controller = Finding("controller", WARN, f"nobody offers the action {name}: start the controller")
+        execution = None if run is None else run.execution
+        words = "waits for a plan" if execution is None else execution.phase.name.lower()
+        level = WARN if execution is not None and execution.phase is Phase.CONFIRMING else OK
+        words += "; call ~/confirm" if level == WARN else ""
+        return (controller, Finding("execution", level, words), *self.newest)
+
+    @property
+    def robot_name(self) -> str:
+        """The robot that is moved."""
+        model = self._source.model
+        return model.robot.name if isinstance(model, Model) else ""
 
     def _forget(self, beams: tuple[Beam, ...]) -> None:
         chosen = self.settings.value
@@ -421,6 +441,8 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
             log, text = self.get_logger(), f"{outcome.status}: {outcome.message}"
             say = log.error if outcome.alarm else log.info if outcome.status in DONE else log.warning
             say(text)
+            level = ERROR if outcome.alarm else OK if outcome.status in DONE else WARN
+            self.outcome("newest plan", level, text)
 
     def _act(self, actions: Sequence[Action]) -> None:
         for action in actions:

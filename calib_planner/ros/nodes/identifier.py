@@ -17,7 +17,6 @@ from dataclasses import asdict, replace
 from calib_planner_msgs.msg import CalibrationEstimate, Measurement, Residuals
 from calib_planner_msgs.msg import Plan as PlanMessage
 from calib_planner_msgs.srv import UndoMeasurement
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
@@ -39,8 +38,8 @@ from calib_planner.io import (
 )
 from calib_planner.ros import session as saving
 from calib_planner.ros.cell import error_model_of
-from calib_planner.ros.diagnostics import diagnostics, health
-from calib_planner.ros.lifecycle import ManagedNode
+from calib_planner.ros.diagnostics import health, identifier_findings
+from calib_planner.ros.lifecycle import Finding, ManagedNode
 from calib_planner.ros.markers import residual_markers
 from calib_planner.ros.messages import (
     ESTIMATE_NUMBERS,
@@ -54,7 +53,7 @@ from calib_planner.ros.messages import (
     stamp_message,
 )
 from calib_planner.ros.model import TOPIC, IdentifiedModel, first_model, heard_model
-from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED
+from calib_planner.ros.parameters import HISTORY, LATCHED
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.residuals import residuals_message, residuals_of
 from calib_planner.ros.session import Matching, Session, TooFew, condition_of
@@ -75,7 +74,6 @@ class IdentifierOutput:
         self._residuals = node.create_publisher(Residuals, "~/residuals", LATCHED)
         self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED)
         self._frames = StaticFrames(node) if node.settings.value.publish_transforms else None
-        self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", EVENTS)
 
     def record(self, session: Session, record: Record) -> None:
         """What became of a standstill."""
@@ -397,20 +395,27 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
             self._output.show(self._model, session, estimate)
 
     def _tick(self) -> None:
-        """Publish diagnostics; look whether a store that could not be opened can be opened now."""
-        session, intake, chosen = self._session, self._intake, self.settings.value
+        """Look whether a store that could not be opened can be opened now."""
+        session = self._session
         if session is not None and isinstance(session.store, UnavailableStore):
             self._reopen()
         self._withdraw_misdated()
-        if intake is not None:
-            for target, trouble in enumerate(self._streams.trouble):
-                count = intake.streams[intake.joint_topics + target]
-                count.reason = trouble or count.reason
-            now = self.now
-            streams = health(intake, now, chosen.diagnostics_period)
-            name = self.get_fully_qualified_name().strip("/")
-            message = diagnostics(name, now, streams, chosen.clock_offset, self._session, self._waiting)
-            self._output.diagnostics.publish(message)
+
+    def findings(self) -> Sequence[Finding]:
+        """How streams, session, estimate and store are."""
+        intake, chosen = self._intake, self.settings.value
+        if intake is None:
+            return identifier_findings((), chosen.clock_offset, None, self._waiting)
+        for target, trouble in enumerate(self._streams.trouble):
+            count = intake.streams[intake.joint_topics + target]
+            count.reason = trouble or count.reason
+        streams = health(intake, self.now, chosen.diagnostics_period)
+        return identifier_findings(streams, chosen.clock_offset, self._session, self._waiting)
+
+    @property
+    def robot_name(self) -> str:
+        """The session's robot."""
+        return "" if self._session is None else self._session.robot.name
 
     def _reopen(self) -> None:
         """Go on with the session of a store that could not be opened, if that is possible now."""

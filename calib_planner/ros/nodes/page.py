@@ -31,7 +31,7 @@ from std_srvs.srv import Trigger
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.io import shipped_robots, user_path
 from calib_planner.ros import page_state
-from calib_planner.ros.lifecycle import ManagedNode, reason_of
+from calib_planner.ros.lifecycle import OK, Finding, ManagedNode, reason_of
 from calib_planner.ros.model import DEFAULT_LEVEL, Model, ModelSource, load_shipped
 from calib_planner.ros.page_server import REPORT, Access, Answer, PageServer
 from calib_planner.ros.page_state import BUTTONS, PageState
@@ -39,7 +39,7 @@ from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED, NEWEST_IN
 from calib_planner.ros.rclpy_ext.polling import Stream, StreamPoller
 from calib_planner.ros.rclpy_ext.run import run
 from calib_planner.ros.settings import PageParameters
-from calib_planner.units import cut
+from calib_planner.units import counted, cut
 
 LOOK = 0.5
 """Time between two looks at who is there [s]."""
@@ -133,6 +133,17 @@ class PageNode(ManagedNode[PageParameters]):
         self._server, self._folder = server, folder
         server.show(self._state)
         self.get_logger().info(f"the page is at {self.url}")
+
+    def findings(self) -> Sequence[Finding]:
+        """Where the page is, without its token, and how many look at it."""
+        chosen = self.settings.value
+        words = f"served at {chosen.host}, {counted(self._server.clients, 'browser')} connected"
+        return (Finding("page", OK, words),)
+
+    @property
+    def robot_name(self) -> str:
+        """The robot that is drawn."""
+        return "" if self._state.robot is None else self._state.robot.name
 
     def deactivate(self) -> None:
         """Answer what is pressed with a refusal from now on; the page stays."""

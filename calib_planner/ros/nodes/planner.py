@@ -26,7 +26,7 @@ from visualization_msgs.msg import MarkerArray
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.planning import Progress
-from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
+from calib_planner.ros.lifecycle import ERROR, OK, WARN, Finding, ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.markers import plan_markers
 from calib_planner.ros.messages import duration_message, in_ros, no_plan, plan_to_message, trajectory_message
 from calib_planner.ros.model import TOPIC, Model, ModelSource
@@ -136,7 +136,23 @@ class PlannerNode(ManagedNode[PlannerParameters]):
                 self.get_logger().error(text)
             else:
                 self.get_logger().info(text)
+            level = {"SUCCESS": OK, "INTERNAL_ERROR": ERROR}.get(result.status, WARN)
+            self.outcome("plan", level, in_ros(text))
         return result
+
+    def findings(self) -> Sequence[Finding]:
+        """Whether there is a robot, whether a plan is searched, and what came of the newest request."""
+        model = self._source.model
+        ready = isinstance(model, Model)
+        robot = Finding("robot", OK if ready else WARN, f"plans for {self.robot_name}" if ready else str(model))
+        searching = Finding("search", OK, "waits for a request" if self._work.ended else "searches a plan")
+        return (robot, searching, *self.newest)
+
+    @property
+    def robot_name(self) -> str:
+        """The robot that is planned for, unless a request names another one."""
+        model = self._source.model
+        return model.robot.name if isinstance(model, Model) else ""
 
     def _fill(
         self, response: PlanService.Response | PlanAction.Result, result: Answer

@@ -30,7 +30,7 @@ from calib_planner.io import config_folder, read_instrument
 from calib_planner.planning import Trajectory
 from calib_planner.ros.cell import cell_of, error_model_of, instrument_of
 from calib_planner.ros.executor import ACTION, NewestPlan, check_executable, dwell_of, feedback_message
-from calib_planner.ros.lifecycle import ManagedNode, OneAtATime, reason_of
+from calib_planner.ros.lifecycle import OK, WARN, Finding, ManagedNode, OneAtATime, reason_of
 from calib_planner.ros.messages import (
     joints_message,
     nanoseconds,
@@ -189,7 +189,9 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
                 goal.abort()
                 return kind(status=kind.BUSY, message="another plan is being executed: wait for it or cancel it")
             try:
-                return self._execute(goal)
+                result = self._execute(goal)
+                self.outcome("newest plan", OK, result.message or "ended")
+                return result
             except CalibPlannerError as error:
                 result = kind(status=kind.INVALID_PLAN, message=cut(error))
                 self.get_logger().warning(f"plan refused: {result.message}")
@@ -198,8 +200,20 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
                 if not self.context.ok():
                     return result  # the process is ending, and the result is not sent
                 self.get_logger().error(result.message)
+            self.outcome("newest plan", WARN, result.message)
             goal.abort()
             return result
+
+    def findings(self) -> Sequence[Finding]:
+        """What the simulated robot does, and what came of the newest plan."""
+        moving = not self._work.ended or self._following is not None
+        words = "executes a plan or a trajectory" if moving else "stands still"
+        return (Finding("robot", OK, words), *self.newest)
+
+    @property
+    def robot_name(self) -> str:
+        """The simulated robot."""
+        return self.world.robot.name
 
     def _execute(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
         plan = plan_from_message(goal.request.plan).plan
