@@ -112,33 +112,36 @@ class DriverStreams:
         self._listener.state(target, message.data)
 
     def look(self) -> None:
-        """Follow the types that are published, if none is stated."""
-        if self._stated:
-            return
-        first = len(self._topics.joints)
-        for target, kind in enumerate(self.kinds):
-            publishers = self._node.get_publishers_info_by_topic(self.poller.topic(first + target))
-            types = sorted({p.topic_type for p in publishers})
-            if not types or kind in types:
-                self._note(target, "")
-                continue
-            usable = [k for k in POINTS if k in types]
+        """Follow the types that are published."""
+        for target, before in enumerate(self.trouble):
+            self.trouble[target] = ""
             try:
-                if not usable:
-                    raise InputError(self._topics.points[target], f"messages of {listed(types)}", listed(POINTS))
-                with self._node.as_configured():
-                    self.poller.change(first + target, self._stream(target, usable[0]))
+                self._follow(target)
             except InputError as error:
-                self._note(target, str(error))
-                continue
-            self.kinds[target] = usable[0]
-            self._note(target, "")
-            self._node.get_logger().info(f"{self._topics.points[target]} is heard as {usable[0]}")
+                self.trouble[target] = str(error)
+                if self.trouble[target] != before:
+                    self._node.get_logger().error(self.trouble[target])
 
-    def _note(self, target: int, trouble: str) -> None:
-        if trouble and trouble != self.trouble[target]:
-            self._node.get_logger().error(trouble)
-        self.trouble[target] = trouble
+    def _follow(self, target: int) -> None:
+        """Listen to a target in the type that is published.
+
+        Raises:
+            InputError: That type is not the one stated, or cannot be used.
+        """
+        topic, number = self._topics.points[target], len(self._topics.joints) + target
+        publishers = self._node.get_publishers_info_by_topic(self.poller.topic(number))
+        types = sorted({p.topic_type for p in publishers})
+        if not types or self.kinds[target] in types:
+            return
+        if self._stated:
+            raise InputError("tracker_type", self._stated, f"the type of {topic}, {listed(types)}")
+        usable = [kind for kind in POINTS if kind in types]
+        if not usable:
+            raise InputError(topic, f"messages of {listed(types)}", listed(POINTS))
+        with self._node.as_configured():
+            self.poller.change(number, self._stream(target, usable[0]))
+        self.kinds[target] = usable[0]
+        self._node.get_logger().info(f"{topic} is heard as {usable[0]}")
 
 
 def type_named(kind: str) -> type:

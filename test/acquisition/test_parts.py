@@ -61,7 +61,7 @@ def cases(count: int) -> list[Parts]:
     return made
 
 
-CASES = repeats(cases(12), cases(150))
+CASES = repeats(cases(9), cases(150))
 
 
 def place(q: np.ndarray) -> np.ndarray:

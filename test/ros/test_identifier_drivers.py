@@ -149,7 +149,7 @@ def test_a_type_that_is_stated_is_listened_to_whatever_is_published(bench: Bench
     driver.destroy_publisher(poses)
     driver.create_publisher(TransformStamped, "tracker/point", SENSOR_OUT)
     bench.wait(lambda: types_of(node) == [POSE, "geometry_msgs/msg/TransformStamped"])
-    node._streams.look()
+    bench.wait(lambda: "tracker_type: expected the type of" in node._streams.trouble[0])
     assert node._streams.kinds == [POSE]
 
 
