@@ -19,7 +19,7 @@ from calib_planner.acquisition import NANO
 from calib_planner.io import config_folder
 from calib_planner.ros.messages import nanoseconds
 from calib_planner.ros.parameters import STREAM_IN
-from calib_planner.ros.settings import ExecutorParameters, SimulatorParameters
+from calib_planner.ros.settings import ExecutorParameters, IdentifierParameters, SimulatorParameters
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "connecting.md").read_text()
 FILES = dict(re.findall(r"<!-- file: (\w+\.py) -->\n```python\n(.*?)```", PAGE, re.DOTALL))
@@ -52,10 +52,12 @@ def test_the_executor_has_the_parameters_that_the_page_names() -> None:
 
 def test_the_rehearsal_uses_parameters_that_exist() -> None:
     blocks = [yaml.safe_load(b) for b in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
-    (values,) = [b["/**"]["ros__parameters"] for b in blocks]
+    (values,) = [b["/**"]["ros__parameters"] for b in blocks if "/**" in b]
     assert SimulatorParameters(**values).outlier_probability == 0.001
     known = yaml.safe_load((config_folder() / "simulator.yaml").read_text())["/**"]["ros__parameters"]
     assert {k: type(v) for k, v in values.items()} == {k: type(known[k]) for k in values}
+    others = {name for b in blocks if "/**" not in b for name in b}
+    assert others <= {item.name for item in fields(IdentifierParameters)}
 
 
 # ── the tracker ──────────────────────────────────────────────────────────────────────────────────────
