@@ -80,6 +80,8 @@ class ProcessorTime:
         self._apart += getattr(node, "workeroutput", {}).get("processor_seconds_apart", 0.0)
 
     def pytest_terminal_summary(self, terminalreporter: Any, config: pytest.Config) -> None:
+        if config.option.collectonly:
+            return
         name_of = NAMES[config.getoption("time_by")]
         rows: dict[str, list[float]] = defaultdict(lambda: [0, 0.0, 0.0])
         for reports in terminalreporter.stats.values():

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import random_configurations
+from robots import random_configurations, repeats
 
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, plan
 from calib_planner.error_model import Prior, typical
@@ -221,11 +221,11 @@ def test_unequal_visits_promise_what_their_rows_promise():
 
 
 def test_the_least_time_for_an_accuracy_is_found_again_by_that_time(monkeypatch):
-    request = problem(search=Search(starts=2))
-    split = plan_for_accuracy_in_time(request, 2e-5, SLOW)
-    assert split.plan.quality.value <= 2e-5
+    request, wanted = problem(search=Search(starts=2)), repeats(3e-5, 2e-5)
+    split = plan_for_accuracy_in_time(request, wanted, SLOW)
+    assert split.plan.quality.value <= wanted
     assert split.timetable.seconds == min(split.seconds)
-    assert plan_for_time(request, SLOW, split.timetable.seconds).plan.quality.value < 2e-5 * 1.02
+    assert plan_for_time(request, SLOW, split.timetable.seconds).plan.quality.value < wanted * 1.02
     monkeypatch.setattr(budget, "MOST_CONFIGURATIONS", 3)
     with pytest.raises(InfeasibleError, match="not reached"):
         plan_for_accuracy_in_time(two_link(), 1e-9, Pace([1.0, 1.0]))
