@@ -48,6 +48,8 @@ from calib_planner.arrays import FloatArray, IntArray, check_array, check_count,
 from calib_planner.errors import InputError
 from calib_planner.units import length, listed, milliseconds
 
+SAME_PLACE = 0.01
+"""Joints differ by no more at one place [rad | m]: what an identifier takes for a planned configuration."""
 IN_A_ROW = 50
 """So many unusable messages in a row get a rejection of their own."""
 
@@ -132,6 +134,19 @@ class Standstill:
     def stamp(self) -> int:
         """Middle of the interval [ns]."""
         return (self.start + self.end) // 2
+
+    def is_again(self, other: Standstill, tolerance: float = SAME_PLACE) -> bool:
+        """Whether it is ``other`` once more: at the same time, as the stamps say, and at the same place.
+
+        A robot cannot stand still twice at the same time: a recording was played twice, or two of them overlap.
+        The stamps alone do not tell it, since the clock of a simulation begins at zero each time.
+
+        Args:
+            other: The standstill before.
+            tolerance: Largest difference of a joint at one place [rad | m].
+        """
+        overlapping = self.start <= other.end and other.start <= self.end
+        return overlapping and bool(np.abs(self.joints - other.joints).max() <= tolerance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ from calib_planner.io.text import user_path
 from calib_planner.io.understanding import STORAGE, BagTopics
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, cut, listed
+from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, counted, cut, listed
 
 WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
 REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
@@ -143,6 +143,8 @@ def read_bag(
         bag = _BagIntake(path, robot, topics, settings, units)
         damage = bag.drain(recording, progress)
     streams, standstills = tuple(bag.intake.streams), tuple(bag.standstills)
+    if bag.repeated:
+        remarks = (*remarks, f"{counted(bag.repeated, 'standstill')} recorded twice, which count once")
     if damage and not accept_damaged:
         counts = ", ".join(f"{s.messages} of {n}" for s, n in zip(streams, recording.promised, strict=True))
         got = f"{damage}; read: {counts} messages of {', '.join(recording.names)}, {len(standstills)} standstills"
@@ -248,6 +250,7 @@ class _BagIntake:
     Attributes:
         intake: Counts the messages and finds the standstills.
         standstills, rejections: The results so far, in the order of completion.
+        repeated: Standstills that came again: a recording was played while this one was made.
     """
 
     def __init__(
@@ -261,6 +264,7 @@ class _BagIntake:
         factors = np.where(robot.joint_is_revolute, ANGLES[units.angle], LENGTHS[units.length]).tolist()
         self._factors = {n: f for n, f in zip(robot.joint_names, factors, strict=True) if f != 1.0}
         self.standstills: list[Standstill] = []
+        self.repeated = 0
         self.rejections: list[Rejection] = []
         assert self.intake.detector is not None
         self._detector = self.intake.detector
@@ -323,7 +327,10 @@ class _BagIntake:
     def _sort(self, results: list[Standstill | Rejection]) -> None:
         for result in results:
             if isinstance(result, Standstill):
-                self.standstills.append(result)
+                if any(result.is_again(one) for one in self.standstills):
+                    self.repeated += 1
+                else:
+                    self.standstills.append(result)
             else:
                 self.rejections.append(result)
 

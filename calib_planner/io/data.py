@@ -101,7 +101,7 @@ def _bag(path: str | Path, robot: Robot, reading: Reading) -> Source:
         angle_from=angle_from,
     )
     numbers = np.arange(1, len(bag.data) + 1)
-    return Source(str(path), bag.data, numbers, "standstill", understanding, (), bag.frame_id)
+    return Source(str(path), bag.data, numbers, "standstill", understanding, (), bag.frame_id, bag.standstills)
 
 
 # ── configurations ───────────────────────────────────────────────────────────────────────────────────

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib_planner.acquisition import Standstill
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.identification import check_units
 from calib_planner.io.data import read_data
 from calib_planner.io.understanding import Reading, Source
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
+from calib_planner.units import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Sources:
 def read_sources(
     paths: Sequence[str], robot: Robot, reading: Reading, *, noise_given: bool, placed: bool = True
 ) -> Sources:
-    """Read files that hold points of as many targets each.
+    """Read files that hold points of as many targets each; a standstill that is in two bags counts once.
 
     Args:
         noise_given: The noise is stated elsewhere; the files' own standard deviations are left out.
@@ -43,7 +45,7 @@ def read_sources(
     Raises:
         FileFormatError: A file cannot be read, or does not fit the others.
     """
-    files = tuple(read_source(path, robot, reading, placed=placed) for path in paths)
+    files = _once([read_source(path, robot, reading, placed=placed) for path in paths], reading)
     first = files[0]
     count = first.data.p.shape[1]
     for other in files[1:]:
@@ -77,6 +79,33 @@ def read_source(path: str, robot: Robot, reading: Reading, *, placed: bool = Tru
     except InputError as error:
         raise FileFormatError(path, error.field, error.got, error.expected, error.advice) from None
     return source
+
+
+def _once(files: Sequence[Source], reading: Reading) -> tuple[Source, ...]:
+    """The files without standstills that are in one before: recordings that overlap, copies of one.
+
+    Raises:
+        FileFormatError: Nothing is left of a file.
+    """
+    taken: list[Standstill] = []
+    result = []
+    for source in files:
+        new = [k for k, s in enumerate(source.standstills) if not any(s.is_again(t) for t in taken)]
+        repeated = len(source.standstills) - len(new)
+        if repeated and not new:
+            got = f"{counted(repeated, 'standstill')} that other bags have"
+            raise FileFormatError(source.path, "standstills", got, "new ones", "a copy is no measurement")
+        if repeated:
+            text = f"{counted(repeated, 'standstill')} that a bag before has, which count once"
+            reading.note(f"{source.path}: {text}")
+            kept = tuple(source.standstills[k] for k in new)
+            rows = np.array(new)
+            source = replace(
+                source, data=source.data.select(rows), numbers=source.numbers[rows], standstills=kept
+            )
+        taken += source.standstills
+        result.append(source)
+    return tuple(result)
 
 
 def _together(files: Sequence[Source], noise_given: bool) -> Measurements:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_planner.acquisition import StandstillSettings
+from calib_planner.acquisition import Standstill, StandstillSettings
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io.columns import PAYLOAD, Meaning, coordinate_names
@@ -221,6 +221,7 @@ class Source:
         understanding: What was recognised about it.
         ignored: Names of the columns that play no part.
         frame_id: Frame of a bag's points; empty if none is named.
+        standstills: Those of a bag, one a row.
     """
 
     path: str
@@ -230,6 +231,7 @@ class Source:
     understanding: Understanding
     ignored: tuple[str, ...] = ()
     frame_id: str = ""
+    standstills: tuple[Standstill, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -275,12 +275,8 @@ class Session:
 
     def _measured_before(self, standstill: Standstill, tolerance: float) -> Record | None:
         """The measurement that a standstill is: at the same time and place."""
-        for record in (*self.records, *self._withdrawn):
-            one = record.standstill
-            overlapping = one.start <= standstill.end and standstill.start <= one.end
-            if overlapping and np.abs(one.joints - standstill.joints).max() <= tolerance:
-                return record
-        return None
+        taken = (*self.records, *self._withdrawn)
+        return next((r for r in taken if standstill.is_again(r.standstill, tolerance)), None)
 
     def _forget(self, record: Record) -> None:
         """Make the estimate anew: a record came or goes; one that is held out leaves the fit as it is."""

@@ -35,7 +35,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from calib_planner import IdentificationProblem, identify
 from calib_planner.acquisition import Rejection, Standstill, StandstillDetector, StandstillSettings
-from calib_planner.io import BagTopics, StoredModel, is_bag, open_store, read_bag
+from calib_planner.errors import FileFormatError
+from calib_planner.io import BagTopics, Reading, StoredModel, is_bag, open_store, read_bag, read_sources
 from calib_planner.io.bag import storage_parts
 from calib_planner.ros.session import Matching, Session
 from calib_planner.simulation import SimulatedCell, random_deviations
@@ -96,6 +97,38 @@ def test_repeated_standstills_stay_rows_of_their_own(tmp_path: Path) -> None:
     data = read_bag(write_bag(tmp_path / "bag", said), PLANAR).data
     np.testing.assert_allclose(data.q, np.repeat(STOPS[:2], [3, 2], axis=0), atol=1e-4)
     assert len(np.unique(data.p[:3, 0, 0])) == 3
+
+
+def test_a_recording_of_a_recording_played_twice_counts_once(tmp_path: Path) -> None:
+    """Also where it was played from its middle."""
+    said = list(SAID)
+    late = max(m.arrival for m in said) + NANO
+    from_its_middle = [replace(m, arrival=m.arrival + late - BEGIN) for m in said if m.stamp > BEGIN + 3 * NANO]
+    twice = read_bag(write_bag(tmp_path / "twice", [*said, *from_its_middle]), PLANAR)
+    once = read_bag(write_bag(tmp_path / "once", said), PLANAR)
+    np.testing.assert_array_equal(twice.data.p, once.data.p)
+    assert any("recorded twice, which count once" in line for line in twice.describe())
+    assert not any("twice, which" in line for line in once.describe())
+
+
+def test_standstills_that_two_bags_share_count_once(tmp_path: Path) -> None:
+    """The second bag begins within the second standstill, the first ends before the fourth."""
+    said, notes = list(SAID), list[str]()
+    whole = read_bag(write_bag(tmp_path / "whole", said), PLANAR)
+    stops = whole.standstills
+    first = [m for m in said if m.stamp < stops[3].start - NANO // 5]
+    paths = [
+        str(write_bag(tmp_path / "first", first)),
+        str(write_bag(tmp_path / "second", [m for m in said if m.stamp > stops[1].start])),
+    ]
+    reading = Reading(note=notes.append)
+    together = read_sources(paths, PLANAR, reading, noise_given=True)
+    assert any("2 standstills that a bag before has, which count once" in note for note in notes)
+    np.testing.assert_allclose(together.data.q, whole.data.q, atol=1e-4)
+    assert together.where(3) == f"standstill 3 of {paths[1]}"
+    copy = str(write_bag(tmp_path / "copy", first))
+    with pytest.raises(FileFormatError, match="a copy is no measurement"):
+        read_sources([paths[0], copy], PLANAR, reading, noise_given=True)
 
 
 def test_two_targets_on_topics_of_any_name(tmp_path: Path) -> None:
