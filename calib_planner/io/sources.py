@@ -98,10 +98,10 @@ def _once(files: Sequence[Source], reading: Reading) -> tuple[Source, ...]:
         if repeated:
             text = f"{counted(repeated, 'standstill')} that a bag before has, which count once"
             reading.note(f"{source.path}: {text}")
-            kept = tuple(source.standstills[k] for k in new)
+            standstills = tuple(source.standstills[k] for k in new)
             rows = np.array(new)
             source = replace(
-                source, data=source.data.select(rows), numbers=source.numbers[rows], standstills=kept
+                source, data=source.data.select(rows), numbers=source.numbers[rows], standstills=standstills
             )
         taken += source.standstills
         result.append(source)
