@@ -80,11 +80,11 @@ def identifier_findings(
         session: The session, or ``None``.
         waiting: Why there is no session.
     """
-    found = [Finding(f"stream {s.name}", *_stream(s, bound)) for s in streams]
+    heard = [Finding(f"stream {s.name}", *_stream(s, bound)) for s in streams]
     if session is None:
-        return [*found, Finding("campaign", ERROR, waiting)]
+        return [*heard, Finding("campaign", ERROR, waiting)]
     parts = (("campaign", _campaign), ("estimate", _estimate), ("store", _store))
-    return [*found, *(Finding(part, *tell(session)) for part, tell in parts)]
+    return [*heard, *(Finding(part, *tell(session)) for part, tell in parts)]
 
 
 Told = tuple[bytes, str, Mapping[str, object]]

@@ -256,9 +256,9 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     def publish_findings(self) -> None:
         """Say on ``/diagnostics`` how the node is."""
         name, made = self.get_fully_qualified_name().strip("/"), bool(self._made)
-        found = [self._own_state(), *(self.findings() if made else ())]
+        every = [self._own_state(), *(self.findings() if made else ())]
         robot = self.robot_name if made else ""
-        message = DiagnosticArray(status=[finding.status(name, robot) for finding in found])
+        message = DiagnosticArray(status=[finding.status(name, robot) for finding in every])
         message.header.stamp = self.get_clock().now().to_msg()
         self.diagnostics.publish(message)
 
