@@ -23,6 +23,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
+from calib_planner.errors import CalibPlannerError
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.processes import own_domain
 from calib_planner.ros.rclpy_ext.run import spin_once
@@ -71,6 +72,7 @@ class Bench:
         self._callers: dict[str, Any] = {}
         self._action_clients: dict[str, ActionClient] = {}
         self.stopping = False
+        self.unforeseen: list[Exception] = []
         self._spinning: list[tuple[Executor, threading.Thread]] = []
         self._spin(self.client, 1)
 
@@ -113,11 +115,24 @@ class Bench:
             node.destroy_node()
         rclpy.shutdown(context=self.context)
         self._kept.close()
+        assert not self.unforeseen, f"a node caught what it did not foresee: {self.unforeseen}"
+
+    def _noting(self, say: Callable[[Exception], None]) -> Callable[[Exception], None]:
+        """``say`` of a node, which goes on after any exception; a test must not leave it an unforeseen one."""
+
+        def noted(error: Exception) -> None:
+            if not isinstance(error, CalibPlannerError) and "made for this test" not in str(error):
+                self.unforeseen.append(error)
+            say(error)
+
+        return noted
 
     def start(self, kind: Callable[..., Node], **parameters: Any) -> Any:
         """The node, spinning; one that starts by itself has done so, or has said why not in ``failure``."""
         node = kind(context=self.context, overrides=overrides(parameters))
         self.nodes.append(node)
+        if isinstance(node, ManagedNode):
+            node._say = self._noting(node._say)
         self._spin(node, getattr(kind, "THREADS", 1))
         if isinstance(node, ManagedNode) and node.settings.value.autostart:
             self.wait(lambda: node.autostarted)

@@ -137,6 +137,13 @@ def test_a_bad_controller(shop: Shop, manner: Manner, status: str, words: str) -
     assert len(shop.controller.goals) == 1
 
 
+def test_good_and_bad_ends_of_one_node(shop: Shop) -> None:
+    """What ends well is logged otherwise than what does not; rclpy refuses both from one line of code."""
+    assert shop.run()[0] == "SUCCESS"
+    shop.controller.manner = Manner(answer=NEVER)
+    assert shop.run(rows=Q[::-1])[0] == "ABORTED"
+
+
 def test_a_late_controller(shop: Shop) -> None:
     shop.controller.manner = Manner(answer=3.0, result=3.0)
     assert shop.run()[0] == "SUCCESS"

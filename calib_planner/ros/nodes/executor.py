@@ -439,8 +439,13 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
         run.ended.set()
         if self.context.ok():
             log, text = self.get_logger(), f"{outcome.status}: {outcome.message}"
-            say = log.error if outcome.alarm else log.info if outcome.status in DONE else log.warning
-            say(text)
+            # A line of code logs at one severity only: rclpy refuses another one from the same place.
+            if outcome.alarm:
+                log.error(text)
+            elif outcome.status in DONE:
+                log.info(text)
+            else:
+                log.warning(text)
             level = ERROR if outcome.alarm else OK if outcome.status in DONE else WARN
             self.outcome("newest plan", level, text)
 
