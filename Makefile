@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test prove docs lint wheel bench soak faults clean
+.PHONY: help setup demo test prove fuzz mutation docs lint wheel bench soak faults clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -15,8 +15,17 @@ demo: setup ## plan, measure and identify a simulated KUKA KR-270 over ROS 2
 test: setup ## run every test, in one process more than there are cores (PYTEST='-k plan' for some)
 	@. ./env.sh && unset PYTHONDONTWRITEBYTECODE && OMP_NUM_THREADS=1 python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST)
 
-prove: setup ## every test with all its seeds and turns, of which make test takes a sample
+prove: setup ## every test with all its seeds and turns, of which make test takes a sample; then fuzz
 	@CALIB_PLANNER_PROVE=1 $(MAKE) test
+	@. ./env.sh && if python -c 'import atheris' 2>/dev/null; then $(MAKE) fuzz; \
+	  else echo "make prove: nothing fuzzed, pip install atheris into .venv first"; fi
+
+FUZZ_SECONDS ?= 600
+fuzz: setup ## fuzz every reader and message conversion, ten minutes each (FUZZ_SECONDS=30; FUZZ='urdf plan' for some)
+	@. ./env.sh && python test/fuzz/fuzz.py --seconds $(FUZZ_SECONDS) $(FUZZ)
+
+mutation: setup ## mutants of formulas that no test catches; all take a day (MUTATION='--sample 20'; JSON to results/)
+	@. ./env.sh && OMP_NUM_THREADS=1 python tools/mutation.py $(MUTATION)
 
 docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
 	@. ./env.sh && python tools/reference && \

@@ -148,6 +148,7 @@ setup(
         "completion": ["shtab>=1.6"],
         "xacro": ["xacro>=2.1"],
         "threads": ["threadpoolctl>=3.1"],
+        "fuzz": ["atheris"],
         "collision": ["pin"],
         "distributed": ["dask[distributed]"],
     },
