@@ -1,12 +1,12 @@
 """Starts all that a real cell needs for a campaign: planner, identifier, executor, campaign and page.
 
     ros2 launch calib_planner campaign.launch.py cell:=cell.yaml
-    ros2 launch calib_planner campaign.launch.py cell:=cell.yaml simulate:=true   # no robot, no tracker: to try it
+    ros2 launch calib_planner campaign.launch.py cell:=cell.yaml simulate:=true   # to try it
     ros2 launch calib_planner campaign.launch.py cell:=left.yaml namespace:=left  # one of two cells
 
-The file of the cell says which robot, tracker, controller and topics there are, where accuracy matters and how much
-of it, and where results are stored: docs/reference/cell.md. Parameters that it does not have can be given by
-params_file. The robot moves when the campaign is started, on the page, whose address is in the log, or by
+The file of the cell says which robot, tracker, controller and topics there are, where accuracy matters and how
+much of it, and where results are stored: docs/reference/cell.md. Parameters that it does not have can be given
+by params_file. The robot moves when the campaign is started, on the page, whose address is in the log, or by
 
     ros2 service call /calibration_campaign/start std_srvs/srv/Trigger      # pause, resume, skip
     ros2 topic echo /calibration_campaign/status

@@ -242,7 +242,7 @@ CELL_KEYS: dict[str, Key] = {
     "joint-topics": Key(_words, "names", "topics of joint states, each with some of the joints (joint_states)"),
     "tracker-topics": Key(_words, "names", "topics of the points, one per target (tracker/point)"),
     "tracker-frames": Key(_words, "names", "child frame of each target, where the tracker sends transforms"),
-    "tracker-locked": Key(_words, "names", "topics on which the tracker says whether it holds each target"),
+    "tracker-state-topics": Key(_words, "names", "topics on which the tracker says whether it holds each target"),
     "controller": Key(Node.text, "name", "action FollowJointTrajectory of the robot's controller"),
     "moveit-group": Key(Node.text, "name", "MoveIt plans every move of this group (straight lines of joints)"),
     "base-frame": Key(Node.text, "name", "frame of the robot's base (base_link)"),
@@ -250,8 +250,8 @@ CELL_KEYS: dict[str, Key] = {
 """Key → how it is read and what it means; the names are those of the options."""
 EITHER = (("instrument", "sigma"), ("mounting", "vertical"), ("speed", "speed-share"))
 """Keys of which one says what the other would."""
-ROS_KEYS = ("store-folder", "joint-topics", "tracker-topics", "tracker-frames", "tracker-locked", "controller",
-            "moveit-group", "base-frame")  # fmt: skip
+ROS_KEYS = ("store-folder", "joint-topics", "tracker-topics", "tracker-frames", "tracker-state-topics",
+            "controller", "moveit-group", "base-frame")  # fmt: skip
 """Keys that no command has as an option."""
 
 
@@ -282,7 +282,7 @@ class Cell:
         settle, dwell: Times at rest, before and for a measurement [s].
         budget, validation: Measurements of a campaign.
         store_folder: Path of a folder.
-        joint_topics, tracker_topics, tracker_frames, tracker_locked: Names of topics and frames.
+        joint_topics, tracker_topics, tracker_frames, tracker_state_topics: Names of topics and frames.
         controller: Name of an action.
         moveit_group: Name of a planning group.
         base_frame: Name of a frame.
@@ -318,7 +318,7 @@ class Cell:
     joint_topics: tuple[str, ...] | None = None
     tracker_topics: tuple[str, ...] | None = None
     tracker_frames: tuple[str, ...] | None = None
-    tracker_locked: tuple[str, ...] | None = None
+    tracker_state_topics: tuple[str, ...] | None = None
     controller: str | None = None
     moveit_group: str | None = None
     base_frame: str | None = None

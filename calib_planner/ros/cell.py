@@ -135,7 +135,7 @@ def _said(cell: Cell, path: str) -> dict[str, Parameters]:
         settle=cell.settle,
         dwell=cell.dwell,
     )
-    controlled = own | _known(tracker_state_topics=cell.tracker_locked, controller_action=cell.controller)
+    controlled = own | _known(tracker_state_topics=cell.tracker_state_topics, controller_action=cell.controller)
     return {
         "planner": measured | pace | _known(accuracy_frame=cell.accuracy_frame),
         "identifier": results
@@ -143,7 +143,7 @@ def _said(cell: Cell, path: str) -> dict[str, Parameters]:
             joint_topics=cell.joint_topics,
             tracker_topics=topics,
             tracker_child_frames=cell.tracker_frames,
-            tracker_state_topics=cell.tracker_locked,
+            tracker_state_topics=cell.tracker_state_topics,
         ),
         "campaign": results
         | _known(

@@ -41,7 +41,7 @@ def test_every_key_is_read_and_paths_are_from_the_file(folder: Path) -> None:
         "required-accuracy: 0.1mm\ntest-pose: [[0, 90], [10, 20]]\nunits: mm,deg\n"
         "speed-share: 0.3\nsettle: 500ms\ndwell: 2\nbudget: 40\nvalidation: 5\nstore-folder: ../store\n"
         "joint-topics: rail/joint_states, arm/joint_states\ntracker-topics: [tracker/one]\n"
-        "tracker-frames: ball\ntracker-locked: tracker/locked\ncontroller: arm/follow_joint_trajectory\n"
+        "tracker-frames: ball\ntracker-state-topics: tracker/locked\ncontroller: arm/follow_joint_trajectory\n"
         "moveit-group: arm\nbase-frame: base\n",
     )
     at = str(folder / "cells" / "..")
@@ -71,7 +71,7 @@ def test_every_key_is_read_and_paths_are_from_the_file(folder: Path) -> None:
         joint_topics=("rail/joint_states", "arm/joint_states"),
         tracker_topics=("tracker/one",),
         tracker_frames=("ball",),
-        tracker_locked=("tracker/locked",),
+        tracker_state_topics=("tracker/locked",),
         controller="arm/follow_joint_trajectory",
         moveit_group="arm",
         base_frame="base",

@@ -241,7 +241,7 @@ dwell: 1
 budget: 30
 validation: 4
 store-folder: store
-tracker-locked: one/locked, two/locked
+tracker-state-topics: one/locked, two/locked
 controller: arm/follow_joint_trajectory
 """
 

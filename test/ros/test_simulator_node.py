@@ -205,6 +205,7 @@ def test_an_error_model(bench: Bench, tmp_path: Path, source: str) -> None:
 def test_the_truth_is_nowhere_on_the_graph(bench: Bench) -> None:
     bench.start(SimulatorNode, robot="planar_2r")
     mine = {
+        "/diagnostics",
         "/rosout",
         "/parameter_events",
         "/joint_states",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from markdown import MADE, code, escaped, joined, table
 
-from calib_planner.io import CELL_KEYS, EITHER
+from calib_planner.io import CELL_KEYS, EITHER, ROS_KEYS
 
 INTRODUCTION = """\
-`calib-planner init` asks what a cell has and writes `cell.yaml`; every command takes it with `--cell cell.yaml`.
+`calib-planner init` asks what a cell has and writes `cell.yaml`; every command takes it with `--cell cell.yaml`,
+and the nodes with `ros2 launch calib_planner campaign.launch.py cell:=cell.yaml`.
 Its keys are the names of the options, and options that are given beside it win. Paths are from the folder of the
 file. A length may carry its unit (`20um`, `0.02mm`). Every key may be left out; one that is not in this table is
 refused."""
@@ -30,6 +31,7 @@ def page() -> str:
     rows = [(code(key), escaped(k.takes), escaped(k.meaning)) for key, k in CELL_KEYS.items()]
     lines = ["# The file of a cell", "", MADE, "", INTRODUCTION, "", "```yaml", *EXAMPLE.splitlines(), "```", ""]
     lines += table(("key", "value", "meaning"), rows)
+    lines += [f"For the nodes alone: {', '.join(code(key) for key in ROS_KEYS)}.", ""]
     pairs = [" and ".join(code(key) for key in pair) for pair in EITHER]
     lines += [f"One of the two only: {'; '.join(pairs)}.", "", *PYTHON.splitlines()]
     return joined(lines)
