@@ -12,16 +12,18 @@ from bench import Bench
 from calib_planner_msgs.action import ExecutePlan
 from calib_planner_msgs.msg import Plan as PlanMessage
 from lifecycle_msgs.msg import Transition
+from rcl_interfaces.msg import Log
 from rclpy.node import Node
 from robots import plan_of
 from std_srvs.srv import Trigger
 
 from calib_planner import Robot
 from calib_planner.planning import Pace, smooth_trajectory
+from calib_planner.ros.execution import Outcome
 from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.nodes import executor as executor_module
-from calib_planner.ros.nodes.executor import ExecutorNode
-from calib_planner.ros.parameters import LATCHED
+from calib_planner.ros.nodes.executor import ExecutorNode, Run
+from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.ros.ways import way_to_message
 
 pytest.importorskip("control_msgs.action", reason="control_msgs is not installed")
@@ -202,6 +204,19 @@ def test_a_robot_that_does_not_stop(bench: Bench) -> None:
     answer = shop.call("stop")
     assert not answer.success and "THE ROBOT STILL MOVES" in answer.message
     assert "THE ROBOT STILL MOVES" in shop.result(handle)[1]
+
+
+def test_every_end_is_said_in_its_severity(shop: Shop) -> None:
+    logs = shop.bench.hear(Log, "/rosout", EVENTS)
+    shop.bench.wait(lambda: shop.bench.client.count_publishers("/rosout"))
+    node = shop.node
+    for status, alarm, severity in (("SUCCESS", False, 20), ("ABORTED", False, 30), ("STOPPED", True, 40)):
+
+        def said(status: str = status, alarm: bool = alarm, severity: int = severity) -> bool:
+            node._finish(Run(ExecutePlan.Goal(), 0.0), Outcome(status, "some words", alarm))
+            return any(m.msg == f"{status}: some words" and m.level == severity for m in logs)
+
+        shop.bench.wait(said)
 
 
 def test_step_by_step(bench: Bench) -> None:
