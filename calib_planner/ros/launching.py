@@ -25,6 +25,7 @@ from launch_ros.substitutions import FindPackageShare
 from calib_planner.errors import InputError
 from calib_planner.ros.cell import node_parameters
 from calib_planner.ros.settings import NODES
+from calib_planner.units import listed
 
 TRUTH = {"true": True, "false": False}
 COMMON = ("robot", "autostart", "use_sim_time")
@@ -60,7 +61,7 @@ def describe(*parts: str, arguments: Sequence[str] = (), rviz: bool = False) -> 
     names = (*COMMON, *arguments)
 
     def start(context: LaunchContext) -> list[Node]:
-        return started({part: {} for part in parts}, names, context)
+        return started({part: {} for part in parts}, names, ["rviz"] if rviz else [], context)
 
     window = show_in_rviz() if rviz else []
     return LaunchDescription([*declared(names), OpaqueFunction(function=start), *window])
@@ -78,7 +79,8 @@ def describe_campaign() -> LaunchDescription:
             get_logger("launch.user").warning(f"{_without(part, simulate)}: {module} is not installed ({how})")
         known = cell and str(_file("cell", cell))
         parameters = node_parameters(known, simulate=simulate, executor="executor" not in missing)
-        return started({p: own for p, own in parameters.items() if p not in missing}, names, context)
+        there = {part: own for part, own in parameters.items() if part not in missing}
+        return started(there, names, ("cell", "simulate", "rviz"), context)
 
     simulate = DeclareLaunchArgument(
         "simulate", default_value="false", choices=[*TRUTH], description=DESCRIPTIONS["simulate"]
@@ -106,12 +108,25 @@ def declared(names: Sequence[str]) -> list[DeclareLaunchArgument]:
     return made
 
 
-def started(parts: Mapping[str, Mapping[str, Any]], names: Sequence[str], context: LaunchContext) -> list[Node]:
+def started(
+    parts: Mapping[str, Mapping[str, Any]], names: Sequence[str], others: Sequence[str], context: LaunchContext
+) -> list[Node]:
     """The nodes, with their own parameters, those of ``params_file`` and the arguments that are given.
+
+    Args:
+        parts: Part → its own parameters.
+        names: Arguments that are parameters.
+        others: Further arguments of the launch file.
+        context: What was given.
 
     Raises:
         InputError: ``params_file`` is no file, or an argument has no usable value.
     """
+    known = {"namespace", "params_file", *names, *others}
+    for name in sorted(set(context.launch_configurations) - known):
+        # No error: a launch file that includes this one has its own arguments in the same place.
+        text = f"{name}: no argument of this launch file, left aside; its arguments are {listed(sorted(known))}"
+        get_logger("launch.user").warning(text)
     path = _text("params_file", context)
     files = [str(_file("params_file", path))] if path else []
     texts = {name: text for name in names if (text := _text(name, context))}
@@ -134,7 +149,7 @@ def _text(name: str, context: LaunchContext) -> str:
 def _file(argument: str, path: str) -> Path:
     full = Path(path).expanduser().resolve()
     if not full.is_file():
-        raise InputError(argument, path, f"a file that is there; looked for {full}")
+        raise InputError(argument, path, "a file that is there", f"looked for {full}")
     return full
 
 

@@ -108,9 +108,8 @@ def described(path: Path, **given: str) -> tuple[dict[str, Argument], list[Start
     """Arguments by name and nodes, those of opaque functions with what is given, else the arguments' defaults."""
     entities = load(path).generate_launch_description().args[0]
     arguments = {e.name: e for e in entities if isinstance(e, Argument)}
-    assert given.keys() <= arguments.keys()
     defaults = {n: a.named["default_value"] for n, a in arguments.items()}
-    context = SimpleNamespace(values=defaults | given)
+    context = SimpleNamespace(values=defaults | given, launch_configurations=defaults | given)
     nodes = [e for e in entities if isinstance(e, Started)]
     for entity in entities:
         if "function" in getattr(entity, "named", {}):
@@ -302,6 +301,18 @@ def test_what_is_not_installed_is_not_started_and_said(
     executor, page = told
     assert "plan_executor" in executor and "sudo apt install ros-$ROS_DISTRO-control-msgs" in executor
     assert "page" in page and "python3-aiohttp" in page
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.name)
+def test_an_argument_that_is_none_is_said(path: Path, stand_ins: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``ros2 launch`` takes any; a misspelt ``simulate`` would move a robot."""
+    told = everything(monkeypatch, "control_msgs", "aiohttp")
+    described(path)
+    assert told == []
+    described(path, simulated="true", parameters="old.yaml")
+    first, second = told
+    assert first.startswith("parameters: no argument") and second.startswith("simulated: no argument")
+    assert "params_file" in first
 
 
 def test_a_campaign_without_a_cell_is_that_of_the_parameters(
