@@ -36,7 +36,8 @@ FILES = {
     "test/robot/test_dh.py",
     "calib_planner/robot/linearisation.py": "test/robot/test_derivatives.py",
     "calib_planner/robot/coupling.py": "test/robot/test_coupling.py",
-    "calib_planner/error_model/gravity.py": "test/error_model/test_terms.py test/error_model/test_link_masses.py",
+    "calib_planner/error_model/gravity.py": "test/error_model/test_terms.py test/error_model/test_link_masses.py "
+    "test/robot/test_coupling.py",
     "calib_planner/error_model/joint_functions.py": "test/error_model/test_terms.py",
     "calib_planner/error_model/placement.py": "test/error_model/test_terms.py",
     "calib_planner/error_model/visits.py": "test/error_model/test_terms.py test/error_model/test_truth.py",

@@ -11,6 +11,7 @@ from robots import MIXED_URDF, mixed, random_configurations
 from calib_planner import InputError, Robot, UnknownNameError
 from calib_planner.cli import main
 from calib_planner.error_model import Gravity, Mass, Poses
+from calib_planner.error_model.gravity import link_points
 from calib_planner.io import parse_urdf, read_estimate
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.robot import Coupling, goals_of, parse_coupling, solve
@@ -249,3 +250,22 @@ def test_a_robot_yaml_says_it_and_plans_and_targets_are_what_is_shown(work, caps
     )
     refused = run(capsys, "compensate", "--robot", "plain.yaml", *asked, code=2)
     assert "couple" in refused["error"]["advice"]
+
+
+@pytest.mark.parametrize("joint", range(6))
+def test_a_mass_loads_the_joints_that_move_it(joint: int) -> None:
+    """Those in front of it, and those coupled to them with any factor: whatever changes where the mass is."""
+    robot = Robot.load("ur10e")
+    names = robot.joint_names
+    robot = robot.with_couplings(
+        [parse_coupling(f"{names[1]}+=0.5*{names[3]}"), parse_coupling(f"{names[5]}-={names[4]}")]
+    )
+    q = random_configurations(robot, 3)
+    at = link_points(robot, q, joint, (0.1, 0.2, 0.3))
+    moves = [
+        np.abs(link_points(robot, q + 1e-3 * unit, joint, (0.1, 0.2, 0.3)) - at).max() > 1e-6
+        for unit in np.eye(6)
+    ]
+    term = Gravity((Mass("load", joint, (0.1, 0.2, 0.3)),))
+    loaded = [name.removeprefix("gravity.load.") for name in term.names(robot)]
+    assert loaded == [name for name, moved in zip(names, moves, strict=True) if moved]
