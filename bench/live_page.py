@@ -1,17 +1,17 @@
-"""The page of ``calibration_page``: first paint, and how soon an update is seen, with 20 clients of which some are slow.
+"""The page of ``calibration_page``: first paint, and how soon an update is seen, with 20 clients, some slow.
 
     python bench/live_page.py [--updates 200] [--clients 20] [--idle 5] [--visits 60]
 
 ``page_node`` runs in a process of its own. This process is the rest of the graph: it publishes the status of a
-campaign, estimates, residuals and measurements of ``--visits`` configurations of a KUKA KR-270, and joint states at
-100 Hz of a robot that moves. One client is a headless Chromium, the others are WebSockets, of which ``--idle`` never
-read.
+campaign, estimates, residuals and measurements of ``--visits`` configurations of a KUKA KR-270, and joint states
+at 100 Hz of a robot that moves. One client is a headless Chromium, the others are WebSockets, of which ``--idle``
+never read.
 
 *First paint* is the browser's own ``first-contentful-paint`` of a page loaded with an empty cache, with all other
 clients connected; *live* is when the first state from the node is on the screen, both from the begin of the
-navigation. *Update* runs from just before a status is published here to the animation frame in which the browser has
-drawn its text; clocks are those of one machine. It holds the middleware, the node, the server, the network and the
-page. JSON goes to standard output.
+navigation. *Update* runs from just before a status is published here to the animation frame in which the
+browser has drawn its text; clocks are those of one machine. It holds the middleware, the node, the server, the
+network and the page. ``load_average`` says what else the machine did. JSON goes to standard output.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import shutil
 import sys
 import tempfile
@@ -129,8 +130,11 @@ def load(chromium: Browser, url: str) -> tuple[Tab, float, float]:
     script = """
     while (document.getElementById("link").textContent !== "live") await new Promise(requestAnimationFrame);
     await new Promise(requestAnimationFrame);
-    const paint = performance.getEntriesByType("paint").find((p) => p.name === "first-contentful-paint");
-    return [paint.startTime, performance.now()];
+    const live = performance.now();
+    const first = () => performance.getEntriesByType("paint").find((p) => p.name === "first-contentful-paint");
+    while (!first()) await new Promise(requestAnimationFrame);
+    const paint = first();
+    return [paint.startTime, live];
     """
     paint, live = tab.run(script)
     return tab, paint, live
@@ -201,6 +205,7 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             "told_per_client_kB": told["bytes"] / max(args.clients - 1 - args.idle, 1) / 1e3,
             "node_cpu_seconds": (int(cpu[13]) + int(cpu[14])) / 100,
             "problems": tab.problems,
+            "load_average": os.getloadavg()[0],
         }
 
 
