@@ -91,7 +91,8 @@
     here(here) {
       if (!view) return;
       view.scene.now = here;
-      controls.redraw();
+      if (here && grown(here)) takeScene(view.scene); // the robot reaches farther than what is drawn: step back
+      else controls.redraw();
     },
 
     verdict(verdict) {
@@ -192,11 +193,22 @@
     choose();
   });
 
+  let extent = []; // two corners of a box around all that the robot has reached [m]
+
+  function grown(body) {
+    const [low, high] = extent.length ? extent : [body[0], body[0]];
+    const corners = [Math.min, Math.max].map((best, k) => [0, 1, 2].map((a) => best([low, high][k][a], ...body.map((p) => p[a]))));
+    const by = Math.max(...corners.flatMap((corner, k) => corner.map((v, a) => Math.abs(v - [low, high][k][a]))));
+    if (extent.length && by < 0.05 * Math.hypot(...[0, 1, 2].map((a) => high[a] - low[a]))) return false;
+    extent = corners;
+    return true;
+  }
+
   function takeScene(scene) {
     byId("nothing-3d").hidden = Boolean(scene);
     if (!scene) return;
     const before = view && view.state;
-    scene.now = data.here || null;
+    Object.assign(scene, { now: data.here || null, extent: extent });
     view = sceneView(scene);
     if (before) Object.assign(view.state, { yaw: before.yaw, pitch: before.pitch, zoom: before.zoom });
     const row = rowChosen(), robot = row ? scene.robot_rows.indexOf(row.row) : -1;

@@ -28,7 +28,7 @@ function sceneView(scene) {
   const robotOf = new Map(scene.robot_rows.map((row, i) => [row, i]));
   const ahead = scene.robot_rows.flatMap((row, i) => (scene.ahead && scene.ahead.includes(row) ? [i] : []));
   const targetOf = (i) => scene.robots[i][scene.robots[i].length - 1];
-  const solid = [[[0, 0, 0]], scene.now || [], scene.robots.flat(), scene.test_robots.flat(), scene.points.filter((_, i) => good[i])].flat();
+  const solid = [[[0, 0, 0]], scene.now || [], scene.extent || [], scene.robots.flat(), scene.test_robots.flat(), scene.points.filter((_, i) => good[i])].flat();
   const bounds = boundsOf(solid);
   const step = [0.1, 0.2, 0.5, 1, 2, 5, 10].find((s) => bounds.radius / s < 5) || 20;
 

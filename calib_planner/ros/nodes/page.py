@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -59,6 +60,7 @@ class Pending:
     """A call that is under way: whose answer it is, and how long it is waited for."""
 
     name: str
+    label: str
     answer: Future[Answer]
     call: Any
     client: Any
@@ -238,7 +240,7 @@ class PageNode(ManagedNode[PageParameters]):
             try:
                 self._ask(name, values, answer)
             except Exception as error:
-                answer.set_result(Answer(False, reason_of(error)))
+                _tell(answer, Answer(False, reason_of(error)))
                 raise
 
     def _ask(self, name: str, values: Mapping[str, Any], answer: Future[Answer]) -> None:
@@ -252,13 +254,14 @@ class PageNode(ManagedNode[PageParameters]):
         elif name in state.waiting and name != "stop":
             reason = reason or "the answer of before has not come yet"
         if reason:
-            answer.set_result(Answer(False, reason))
+            _tell(answer, Answer(False, reason))
             return
         request = Trigger.Request()
         if name == "skip_configuration":
             request = SkipConfiguration.Request(configuration_index=values["number"], replace=values["replace"])
         patience = LONG_PATIENCE if name in SLOW else PATIENCE
-        pending = Pending(name, answer, client.call_async(request), client, time.monotonic() + patience)
+        label = "Replace" if values.get("replace") is True else BUTTONS[name].label
+        pending = Pending(name, label, answer, client.call_async(request), client, time.monotonic() + patience)
         self._calls.append(pending)
         self._set(replace(state, waiting=state.waiting | {name}))
         pending.call.add_done_callback(lambda _: self._answered(pending))
@@ -279,18 +282,23 @@ class PageNode(ManagedNode[PageParameters]):
         if pending in self._calls:
             self._calls.remove(pending)
         state = replace(self._state, waiting=frozenset(a.name for a in self._calls))
-        text = f"{BUTTONS[pending.name].label}: {answer.text}"
+        text = f"{pending.label}: {answer.text}"
         if pending.name == "report" and answer.done:
             state = replace(state, report=self._report_of(answer.text))
         self._set(page_state.told(state, "good" if answer.done else "bad", text, time.time()))
-        if not pending.answer.done():
-            pending.answer.set_result(answer)
+        _tell(pending.answer, answer)
 
     def _report_of(self, text: str) -> str:
         """The name of the report that an answer names, if the page may show it; else empty."""
         name = Path(text.rpartition(" ")[2]).name
         shown = self._folder is not None and REPORT.fullmatch(name) and (self._folder / name).is_file()
         return name if shown else ""
+
+
+def _tell(waiting: Future[Answer], answer: Answer) -> None:
+    """Answer who waits, unless the browser has gone meanwhile."""
+    with suppress(InvalidStateError):
+        waiting.set_result(answer)
 
 
 def main(args: Sequence[str] | None = None) -> int:
