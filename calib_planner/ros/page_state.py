@@ -563,14 +563,16 @@ def _now(state: PageState) -> dict[str, Any]:
     return {"kind": kind, "word": word, "title": title, "reason": _sentence(reason), **count}
 
 
-SERVICE = re.compile(r"(?:\bcall )?~/([a-z_]+)")
+SERVICE = re.compile(r"(\bcall )?~/([a-z_]+)")
 """How a text on a topic names a service."""
 
 
 def _pressed(named: re.Match[str]) -> str:
     """The service as a person at the page knows it."""
-    button = BUTTONS.get(named[1])
-    return named[0] if button is None else f"press {button.label}"
+    button = BUTTONS.get(named[2])
+    if button is None:
+        return named[0]
+    return f"press {button.label}" if named[1] else button.label
 
 
 def _posture(state: PageState) -> dict[str, Any] | None:

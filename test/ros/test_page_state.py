@@ -116,10 +116,10 @@ def test_which_visit_of_how_many(script: Script) -> None:
 
 
 def test_services_in_texts_are_the_buttons_of_the_page(script: Script) -> None:
-    text = "paused on request: call ~/resume; ~/unknown"
+    text = "somebody called ~/stop: call ~/resume; ~/unknown"
     state = ps.on_status(PageState(names=NAMES), script.status(S.PAUSED, 3, reason=text))
     state = replace(state, there=frozenset(NAMES.values()))
-    assert sections(state)["now"]["reason"] == "Paused on request: press Resume; ~/unknown"
+    assert sections(state)["now"]["reason"] == "Somebody called STOP: press Resume; ~/unknown"
 
 
 def test_the_posture_is_that_of_the_present_configuration(script: Script) -> None:
