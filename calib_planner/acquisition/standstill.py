@@ -212,7 +212,7 @@ class StandstillDetector:
             values = check_array("positions", positions, (self.joint_count,), finite=False, meaning=meaning)
             if len(self._joints.parts) == 1:
                 return self._add(0, stamp, values)
-            columns = self._all
+            columns = tuple(range(self.joint_count))
         else:
             values = check_array("positions", positions, (len(columns),), finite=False, meaning=meaning)
         routes = self._routes.get(columns)
@@ -242,7 +242,6 @@ class StandstillDetector:
 
     def _arrange(self) -> None:
         """Follow the parts of the joints."""
-        self._all = tuple(range(self.joint_count))
         self._part = {p.columns[0]: p for p in self._joints.parts}
         self._routes: dict[tuple[int, ...], list[tuple[int, IntArray]]] = {}
         n = self.joint_count
@@ -252,11 +251,9 @@ class StandstillDetector:
         """Take a point (3,) [m] of target number ``target``, from 0; NaN = not seen."""
         self._check_target(target)
         values = check_array("xyz", xyz, (3,), finite=False)
-        return (
-            []
-            if self._losses[target].takes(stamp, _ns(self.settings.window))
-            else self._add(self.joint_count + target, stamp, values)
-        )
+        if self._losses[target].takes(stamp, _ns(self.settings.window)):
+            return []
+        return self._add(self.joint_count + target, stamp, values)
 
     def set_lost(self, target: int, lost: bool) -> None:
         """The tracker says that it has lost target number ``target``, from 0, or that it sees it (again)."""
