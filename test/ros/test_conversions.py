@@ -47,6 +47,7 @@ def test_every_status_has_a_constant() -> None:
     assert set(LIBRARY_PLAN_STATUS) <= set(c.PLAN_STATUS)
     assert set(LIBRARY_ESTIMATE_STATUS) <= set(c.ESTIMATE_STATUS)
     assert {r.value for r in RejectionReason} <= set(c.MEASUREMENT_STATUS)
+    assert len(set(c.MEASUREMENT_STATUS.values())) == len(c.MEASUREMENT_STATUS)
     for message, table, prefix in (
         (PlanMessage, c.PLAN_STATUS, "STATUS_"),
         (CalibrationEstimate, c.ESTIMATE_STATUS, "STATUS_"),
