@@ -10,8 +10,8 @@ campaign.
     python bench/faults_nodes.py                            # all faults × 20 seeds, a process per core
     python bench/faults_nodes.py --faults none --seeds 3 --jobs 1
 
-The table goes to stderr, JSON to stdout, which also has the processor time. A fault and a seed that are named in
-the table can be looked at alone: ``--faults NAME --first SEED --seeds 1 --keep FOLDER``.
+The table goes to stderr, JSON with the processor time of each campaign to stdout; Ctrl-C ends it with what is
+done. A fault and a seed can be looked at alone: ``--faults NAME --first SEED --seeds 1 --keep FOLDER``.
 """
 
 from __future__ import annotations
@@ -161,14 +161,21 @@ def work() -> None:
         print(json.dumps(asdict(one(fault, seed, None if keep is None else Path(keep)))), flush=True)
 
 
+STOPPED = threading.Event()
+"""Set by Ctrl-C: what is done is shown."""
+RUNNING: list[subprocess.Popen[str]] = []
+"""The processes at work."""
+
+
 def share(tasks: list[tuple[str, int]], keep: Path | None, note: Callable[[Run], None]) -> None:
     """Have processes make ``tasks``, one after the other; one that ends or does nothing more is replaced."""
     left = list(tasks)
-    while left:
+    while left and not STOPPED.is_set():
         with subprocess.Popen(
             [sys.executable, __file__, "--work"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         ) as process:
             assert process.stdin is not None and process.stdout is not None
+            RUNNING.append(process)
             timer = threading.Timer(PATIENCE * len(left), process.kill)
             timer.start()
             where = None if keep is None else str(keep)
@@ -178,7 +185,8 @@ def share(tasks: list[tuple[str, int]], keep: Path | None, note: Callable[[Run],
                 note(Run(**json.loads(line)))
                 left.pop(0)
             timer.cancel()
-        if left:
+            RUNNING.remove(process)
+        if left and not STOPPED.is_set():
             end, why = ("hung", "killed") if process.returncode == -9 else ("crash", f"{process.returncode}")
             note(Run(*left.pop(0), end, why=f"its process ended: {why}"))
 
@@ -196,8 +204,14 @@ def runs(names: Sequence[str], seeds: Sequence[int], jobs: int, keep: Path | Non
     wanted = [(name, seed) for seed in seeds for name in names if seed in few or "_and_" not in name]
     with ThreadPoolExecutor(jobs) as pool:
         shares = [wanted[i : i + SHARE] for i in range(0, len(wanted), SHARE)]
-        for future in [pool.submit(share, tasks, keep, note) for tasks in shares]:
-            future.result()
+        try:
+            for future in [pool.submit(share, tasks, keep, note) for tasks in shares]:
+                future.result()
+        except KeyboardInterrupt:
+            STOPPED.set()
+            for process in list(RUNNING):
+                process.terminate()
+            print("interrupted: what is done so far", file=sys.stderr)
     return {name: sorted(found, key=lambda r: r.seed) for name, found in done.items()}
 
 
