@@ -38,6 +38,8 @@ from calib_planner.units import counted, cut
 
 BEAM_ADVICE = "bring the beam back, then send the rest of the plan"
 REFUSED = "the controller refused the move"
+CANCEL_AGAIN = 1.0
+"""After so long without an end a goal is cancelled once more, since a request can get lost [s]."""
 SET_BACK = 1.0
 """A clock that goes back by more than this was set, or a simulation began again [s]."""
 
@@ -434,6 +436,7 @@ class Goal:
         over: When it was over [s]; ``None`` as long as it is not known to be.
         failure: How it ended if not successfully.
         arrived: Whether the robot stood at its end once.
+        cancelled: When it was cancelled last [s]; ``None`` if it was not.
     """
 
     number: int
@@ -443,6 +446,7 @@ class Goal:
     over: float | None = None
     failure: str = ""
     arrived: bool = False
+    cancelled: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -577,7 +581,11 @@ def _end(
     state = _to(state, Phase.STOPPING, ending=ending)
     if goal is None:
         return _to(state, Phase.ENDED, outcome=ending.with_words("")), ()
-    return state, (Cancel(goal.number),) if under_way else ()
+    return _cancelled(state, goal) if under_way else (state, ())
+
+
+def _cancelled(state: Execution, goal: Goal) -> tuple[Execution, Actions]:
+    return replace(state, goal=replace(goal, cancelled=state.now)), (Cancel(goal.number),)
 
 
 # ── what follows in each phase ───────────────────────────────────────────────────────────────────────
@@ -779,7 +787,8 @@ def _stopping(state: Execution) -> tuple[Execution, Actions]:
         done = f"the robot stands, after {counted(state.executed, 'standstill')}"
         return _to(state, Phase.ENDED, outcome=ending.with_words(done)), ()
     if state.now - state.since <= view.watch.patience:
-        return state, ()
+        again = goal.over is None and goal.cancelled is not None and state.now - goal.cancelled > CANCEL_AGAIN
+        return _cancelled(state, goal) if again else (state, ())
     if view.silence(state.now) or not seen:
         words = "WHETHER THE ROBOT STANDS IS NOT KNOWN, since joint_states are missing: look at it"
     elif not stands:

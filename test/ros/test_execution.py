@@ -140,7 +140,7 @@ def test_a_bad_controller(manner: Manner, status: str, words: str) -> None:
     assert ended(it)[0] == status and words in ended(it)[1], ended(it)
     assert it.execution.executed <= 1 and len(sends(it)) == 1
     over = {"refused", "failure", "preempted"} & {k for k, v in vars(manner).items() if v != getattr(GOOD, k)}
-    assert cancels(it) == ([] if over or manner.refuse else [sends(it)[0].number])
+    assert set(cancels(it)) == (set() if over or manner.refuse else {sends(it)[0].number})
 
 
 def test_a_late_answer_is_waited_for() -> None:
@@ -165,7 +165,7 @@ def test_who_accepts_while_it_stops_is_cancelled_again() -> None:
     it.feed(STOP)
     assert len(cancels(it)) == 1
     assert ended(it)[0] == "STOPPED"
-    assert len(cancels(it)) == 2 and np.allclose(it.arm.joints(it.now), HOME, atol=1e-3)
+    assert len(cancels(it)) >= 2 and np.allclose(it.arm.joints(it.now), HOME, atol=1e-3)
 
 
 def test_a_robot_that_does_not_stop_is_said_loudly() -> None:
@@ -184,6 +184,18 @@ def test_a_controller_that_does_not_confirm_its_end() -> None:
     it.feed(STOP)
     status, words = ended(it)
     assert status == "STOPPED" and "does not say that its move is over" in words
+
+
+def test_a_request_to_cancel_that_gets_lost_is_sent_again() -> None:
+    it = cell()
+    it.run_to("MOVING")
+    it.run(0.5)
+    it.manner = replace(GOOD, halts=False)  # nobody hears the first one
+    it.feed(STOP)
+    assert len(cancels(it)) == 1
+    it.manner = GOOD
+    status, words = ended(it, 10.0)
+    assert status == "STOPPED" and "the robot stands, after 0 standstills" in words and len(cancels(it)) == 2
 
 
 def test_silence_ends_it() -> None:

@@ -14,7 +14,7 @@ from calib_planner_msgs.msg import Plan as PlanMessage
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import Log
 from rclpy.node import Node
-from robots import plan_of
+from robots import plan_of, repeats
 from std_srvs.srv import Trigger
 
 from calib_planner import Robot
@@ -120,18 +120,19 @@ def test_the_newest_plan_by_a_service(shop: Shop) -> None:
     assert np.allclose(shop.controller.joints, Q[1])
 
 
-@pytest.mark.parametrize(
-    ("manner", "status", "words"),
-    [
-        (Manner(refuse=True), "NOT_READY", "the controller refused the move: is it active"),
-        (Manner(answer=NEVER), "ABORTED", "does not answer"),
-        (Manner(failure="q1: 0.3 rad"), "ABORTED", "it was aborted, PATH_TOLERANCE_VIOLATED (-4), q1: 0.3 rad"),
-        (Manner(result=NEVER), "ABORTED", "does not report the end"),
-        (Manner(rate=0.0), "ABORTED", "q2 is at 0.2000 rad"),
-        (Manner(rate=0.4), "ABORTED", "rad are allowed"),
-        (Manner(beyond=0.4), "ABORTED", "rad are allowed"),
-    ],
-)
+BAD = [
+    (Manner(refuse=True), "NOT_READY", "the controller refused the move: is it active"),
+    (Manner(answer=NEVER), "ABORTED", "does not answer"),
+    (Manner(failure="q1: 0.3 rad"), "ABORTED", "it was aborted, PATH_TOLERANCE_VIOLATED (-4), q1: 0.3 rad"),
+    (Manner(result=NEVER), "ABORTED", "does not report the end"),
+    (Manner(rate=0.0), "ABORTED", "q2 is at 0.2000 rad"),
+    (Manner(rate=0.4), "ABORTED", "rad are allowed"),
+    (Manner(beyond=0.4), "ABORTED", "rad are allowed"),
+]
+"""How a controller may behave, the status that follows and words of its message; `test_execution` has more."""
+
+
+@pytest.mark.parametrize(("manner", "status", "words"), BAD[: repeats(5, 7)])
 def test_a_bad_controller(shop: Shop, manner: Manner, status: str, words: str) -> None:
     shop.controller.manner = manner
     got = shop.run()
