@@ -428,7 +428,11 @@ class ExecutorNode(ManagedNode[ExecutorParameters]):
             place = ", ".join(f"{name}={value:.4f}" for name, value in names)
             self.get_logger().warning(f"configuration {execution.index} ({place}) is next: call ~/confirm")
         elif execution.phase is Phase.STOPPING and execution.ending is not None:
-            self.get_logger().warning(f"stopping the robot: {execution.ending.message}")
+            text = f"stopping the robot: {execution.ending.message}"
+            if execution.ending.status == "CANCELLED":  # a campaign does so with what it has heard enough of
+                self.get_logger().info(text)
+            else:
+                self.get_logger().warning(text)
 
     def _finish(self, run: Run, outcome: Outcome) -> None:
         if run.outcome is not None:
