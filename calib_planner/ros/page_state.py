@@ -180,6 +180,7 @@ class PageState:
         joints: Where the robot is now [rad | m], in the robot's order; empty before it is heard.
         there: Names of services that are offered, and of nodes that are there.
         names: Part (``campaign``, ``identifier``, ``executor``) → name of its node.
+        namespace: Of the page, in which these names are, unless they begin with a slash.
         waiting: Buttons whose answer has not come.
         report: Name of the newest report that the page can show.
     """
@@ -195,6 +196,7 @@ class PageState:
     joints: tuple[float, ...] = ()
     there: frozenset[str] = frozenset()
     names: Mapping[str, str] = field(default_factory=dict)
+    namespace: str = ""
     waiting: frozenset[str] = frozenset()
     journal: tuple[Line, ...] = ()
     report: str = ""
@@ -320,7 +322,9 @@ def on_residuals(state: PageState, message: Residuals) -> PageState:
 
 def on_diagnostics(state: PageState, message: DiagnosticArray) -> PageState:
     """The streams of the identifier; what other nodes say is passed over."""
-    begin = f"{state.names.get('identifier', '')}: stream "
+    name = state.names.get("identifier", "")
+    full = name if name.startswith("/") else f"{state.namespace}/{name}"
+    begin = f"{full.strip('/')}: stream "
     mine = [s for s in message.status if s.name.lstrip("/").startswith(begin)]
     if not mine:
         return state

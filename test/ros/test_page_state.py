@@ -177,6 +177,17 @@ def test_streams_stand_still_or_move(script: Script) -> None:
     assert shown == {"name": "x", "level": "STALE", "text": "", "motion": ""}
 
 
+@pytest.mark.parametrize(
+    ("named", "mine"), [("identifier", "left/identifier"), ("/right/identifier", "right/identifier")]
+)
+def test_streams_of_another_cell_are_not_shown(script: Script, named: str, mine: str) -> None:
+    """Both cells speak on one topic."""
+    cells = ("identifier", "left/identifier", "right/identifier")
+    array = DiagnosticArray(status=[DiagnosticStatus(name=f"{cell}: stream of {cell}") for cell in cells])
+    state = PageState(names={"identifier": named}, namespace="/left")
+    assert [s.name for s in ps.on_diagnostics(state, array).streams] == [f"of {mine}"]
+
+
 # ── the scene ────────────────────────────────────────────────────────────────────────────────────────
 
 

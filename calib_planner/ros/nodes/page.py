@@ -84,7 +84,7 @@ class PageNode(ManagedNode[PageParameters]):
         """Serve the page, listen to the others."""
         chosen = self.settings.value
         names = {part: getattr(chosen, part) for part in ("campaign", "identifier", "executor")}
-        self._state = PageState(names=names)
+        self._state = PageState(names=names, namespace=self.get_namespace())
         self._pressed: SimpleQueue[tuple[str, Mapping[str, Any], Future[Answer]]] = SimpleQueue()
         self._calls: list[Pending] = []
         self._joints: dict[str, float] = {}
