@@ -6,12 +6,23 @@ field, what was got, what is valid, and what to do.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from difflib import get_close_matches
 
+CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+"""Characters that break a line, move a cursor or colour a terminal."""
+
 
 class CalibPlannerError(Exception):
-    """Root of all errors raised on purpose by calib_planner."""
+    """Root of all errors raised on purpose by calib_planner.
+
+    Its text is one line, whatever stands in names that came over the wire or out of a file.
+    """
+
+    def __str__(self) -> str:
+        """The text, with control characters written out."""
+        return CONTROLS.sub(lambda found: repr(found[0])[1:-1], super().__str__())
 
 
 class InputError(CalibPlannerError, ValueError):

@@ -390,7 +390,7 @@ def _by_place(table: Table, wanted: _Wanted) -> Meaning:
         clock = re.search(r"\d:\d\d|\d{4}-\d\d|\d\.\d\d\.\d{4}", first[len(columns)])
         columns.append(Column("time" if clock else "name") if wanted.keys else Column())
     rest = width - len(columns) - count
-    if rest % 3 == 1:
+    if rest > 0 and rest % 3 == 1:
         if _counts_rows(table, len(columns)):
             columns.append(Column("name") if wanted.keys else Column())
         elif wanted.keys and _grows(table, len(columns)):

@@ -61,6 +61,25 @@ def test_every_column_moves_the_points_as_its_deflection_does(robot: Robot) -> N
         np.testing.assert_allclose(columns @ coefficients, gradient, atol=1e-12 * np.abs(gradient).max())
 
 
+def test_every_coefficient_has_a_name_and_a_column(robot: Robot) -> None:
+    model, poses = typical(), Poses(robot, random_configurations(robot, 2))
+    for term in model.systematic:
+        names = term.names(robot)
+        assert len(names) == len(set(names)) == term.size(robot) == term.columns(poses).shape[2]
+    wave = JointFunctions(("smooth",), 4)
+    joints = [n for n in wave.names(robot) if n.startswith(f"{robot.joint_names[0]}.")]
+    assert [n.rpartition(".")[2] for n in joints] == [
+        "cos1",
+        "cos2",
+        "cos3",
+        "cos4",
+        "sin1",
+        "sin2",
+        "sin3",
+        "sin4",
+    ]
+
+
 def test_placement_columns_are_the_jacobian_and_priors_go_by_kind(robot: Robot) -> None:
     poses = Poses(robot, random_configurations(robot, 3))
     placement, values = Placement(), {"placement.length": 4e-4, "placement.angle": 2e-3}

@@ -62,7 +62,10 @@ def main() -> int:
         limits = [f"-max_total_time={options.seconds}", "-timeout=10", "-rss_limit_mb=2048", "-verbosity=0"]
         limits += ["-print_final_stats=1", f"-artifact_prefix={KEPT}/failed-{name}-"]
         command = [sys.executable, __file__, "--inside", name, *limits, *folders]
-        status = subprocess.run(command, cwd=KEPT).returncode
+        try:
+            status = subprocess.run(command, cwd=KEPT, timeout=2 * options.seconds + 300).returncode
+        except subprocess.TimeoutExpired:  # it is killed by then
+            status = 124
         print(f"fuzz {name}: {'nothing' if status == 0 else f'FAILED (status {status})'}", flush=True)
         failed += [name] if status else []
     return len(failed)
