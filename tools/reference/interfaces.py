@@ -54,6 +54,7 @@ def nodes() -> dict[str, list[tuple[str, ...]]]:
     from rclpy.context import Context
 
     from calib_planner.ros.nodes.campaign import CampaignNode
+    from calib_planner.ros.nodes.executor import ExecutorNode
     from calib_planner.ros.nodes.identifier import IdentifierNode
     from calib_planner.ros.nodes.planner import PlannerNode
     from calib_planner.ros.nodes.simulator import SimulatorNode
@@ -62,7 +63,7 @@ def nodes() -> dict[str, list[tuple[str, ...]]]:
     context.init(args=["--ros-args", "-r", f"__ns:={NAMESPACE}"], domain_id=DOMAIN)
     found = {}
     try:
-        for kind in (PlannerNode, IdentifierNode, SimulatorNode, CampaignNode):
+        for kind in (PlannerNode, IdentifierNode, ExecutorNode, SimulatorNode, CampaignNode):
             node = kind(context=context)
             node.trigger_configure()
             node.trigger_activate()
@@ -89,7 +90,8 @@ def _ends(node: Any) -> Iterator[tuple[str, ...]]:
         for service in services:
             yield from _end(own, getattr(service, "service_name", service.srv_name), words, service.srv_type)
     for name, kinds in get_action_server_names_and_types_by_node(node, node.get_name(), NAMESPACE):
-        yield code(_short(own, name)), "offers action", code(kinds[0].replace("/action/", "/")), ""
+        if not kinds[0].startswith("control_msgs/"):  # optional: the page is the same with and without it
+            yield code(_short(own, name)), "offers action", code(kinds[0].replace("/action/", "/")), ""
 
 
 def _end(own: str, name: str, words: str, kind: Any, quality: str = "") -> Iterator[tuple[str, ...]]:
