@@ -116,7 +116,7 @@ def run(fault: str, seed: int, folder: Path) -> Run:
     with Stage() as stage:
         parameters = {name: plain(values) for name, values in given(cases()[fault], seed, folder).items()}
         # No search ends by the time that it took: that would depend on the machine.
-        parameters["campaign_node"] |= {"budget": BUDGET, "time_limit": 86400.0}
+        parameters["campaign_node"] |= {"budget": BUDGET, "time_limit": 86400.0, "longest_wait": 15.0}
         desk = Desk(stage)
         try:
             stage.start(IdentifierNode, parameters["identifier_node"])

@@ -279,7 +279,7 @@ class Stage:
         """Called by such a thread: it rests."""
         self._resting.append(resting)
         self._back.set()
-        while not resting.turn.wait(0.01):
+        while not resting.turn.wait(0.2):
             if resting.end.is_set() and resting in self._resting:  # the node ends, and waits for this
                 self._resting.remove(resting)
                 return
