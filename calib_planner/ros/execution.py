@@ -124,7 +124,8 @@ class Beam:
         if self.locked is None:
             return ""
         if 0 < watch.beam_silence < now - self.heard:
-            return f"{self.topic}: the tracker has said nothing for {now - self.heard:.1f} s"
+            words = "set beam_silence to 0 if it speaks at changes only"
+            return f"{self.topic}: the tracker has said nothing for {now - self.heard:.1f} s ({words})"
         lost = not self.locked and now - self.changed >= watch.beam_patience
         return f"{self.topic}: the tracker has lost the reflector" if lost else ""
 
