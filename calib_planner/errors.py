@@ -22,7 +22,7 @@ class CalibPlannerError(Exception):
 
     def __str__(self) -> str:
         """The text, with control characters written out."""
-        return CONTROLS.sub(lambda found: repr(found[0])[1:-1], super().__str__())
+        return CONTROLS.sub(lambda one: repr(one[0])[1:-1], super().__str__())
 
 
 class InputError(CalibPlannerError, ValueError):

@@ -60,6 +60,7 @@ class Client(ActionClient):
         with self._turn:
             await super().execute(taken_data)
 
+
 FORESEEN = ("made for this test", "Transition is not registered", "is not a valid Parameter.Type")
 """Parts of what is raised on purpose: by tests, and by rclpy where a test asks for what there is not."""
 

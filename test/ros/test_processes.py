@@ -192,7 +192,8 @@ def test_a_domain_is_given_to_one_at_a_time_and_only_if_nobody_is_there(monkeypa
 
 def test_a_node_starts_without_what_it_does_not_need_at_once() -> None:
     """Pictures, reports and bags take longer to import than all the rest of a node."""
-    names = [name.removesuffix("_node") for name in node_names() if name != "page_node"]  # that is made of reports
+    # The page is made of reports.
+    names = [name.removesuffix("_node") for name in node_names() if name != "page_node"]
     modules = ", ".join(f"calib_planner.ros.nodes.{name}" for name in names)
     late = ("matplotlib", "jinja2", "rosbags", "scipy.stats", "scipy.optimize", "calib_planner.report")
     program = f"import sys, {modules}; print(*(m for m in {late} if m in sys.modules))"
