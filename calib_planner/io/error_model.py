@@ -46,9 +46,9 @@ def read_error_model(source: str | Path, noise: Noise | None = None) -> ErrorMod
 def _saved(path: str | Path) -> Node:
     """The mapping of a model in a file of its own or in an estimate."""
     if read_yaml(path, "a YAML file with an error model").value.get("format") != "calib_planner/estimate":
-        return read_document(path, KIND)["error_model"]
+        return read_document(path, KIND).mapping(None, ("error_model",))["error_model"]
     part = read_document(path, "estimate").get("error_model")
     if part.value is None:
         advice = "it is of an older version: identify again"
         raise part.error("nothing", "the error model of the estimate", advice)
-    return part["model"]
+    return part.mapping(None, ("model",))["model"]
