@@ -56,7 +56,7 @@ from calib_planner.io.text import user_path
 from calib_planner.io.understanding import STORAGE, BagTopics
 from calib_planner.measurements import Measurements
 from calib_planner.robot import Robot
-from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, counted, cut, listed
+from calib_planner.units import ANGLES, LENGTHS, SI, UNSAID, Units, brief, counted, cut, listed
 
 WHAT = "a rosbag2 folder or a .db3 or .mcap file of one"
 REPAIR = "repair it with 'ros2 bag reindex FOLDER' or, for .mcap, 'mcap recover FILE'"
@@ -419,6 +419,10 @@ def open_bag(path: str | Path, topics: BagTopics) -> Iterator[Recording]:
                 readers.append(stack.enter_context(reader_class(part)))
             except Exception as error:
                 raise FileFormatError(part, "bag", reason(error), WHAT, REPAIR) from None
+            for one in readers[-1].connections:
+                if not (isinstance(one.topic, str) and isinstance(one.msgtype, str)):
+                    got = f"a topic {brief(one.topic, 60)} of type {brief(one.msgtype, 60)}"
+                    raise FileFormatError(part, "bag", got, "names that are texts", REPAIR)
         kinds = _kinds(path, readers, topics)
         promised = tuple(
             sum(c.msgcount for r in readers for c in r.connections if c.topic == name) for name in topics.names
