@@ -260,7 +260,9 @@ def test_visits_that_are_near_push_each_other_away() -> None:
     q = 0.03 * rng.standard_normal((2, 4, 6))
     q[0, 1] += 2 * np.pi * np.eye(6)[3]
     rows = q.reshape(2, -1)
-    cost = repelling(lambda x: (np.zeros(len(x)), np.zeros(x.shape)), robot, 4)
+    nothing = lambda x: (np.zeros(len(x)), np.zeros(x.shape))  # noqa: E731
+    assert repelling(nothing, robot, 1) is nothing  # one visit is near no other
+    cost = repelling(nothing, robot, 4)
     value, gradient = cost(rows)
     assert (value > 0).all()
     steps = 1e-6 * np.eye(24)
