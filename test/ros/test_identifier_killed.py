@@ -17,7 +17,7 @@ from calib_planner_msgs.msg import CalibrationEstimate, Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from geometry_msgs.msg import PointStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from robots import plan_of, random_configurations
+from robots import plan_of, random_configurations, repeats
 from sensor_msgs.msg import JointState
 
 from calib_planner import Robot
@@ -124,7 +124,7 @@ def stored(folder: Path) -> list[int | None]:
 def test_a_node_killed_while_it_is_fed_goes_on(tmp_path: Path) -> None:
     rng, log, stamp = random.Random(2), tmp_path / "log", 1000 * NANO
     finals = []
-    for name, kills in (("undisturbed", 0), ("killed", 3)):
+    for name, kills in (("undisturbed", 0), ("killed", repeats(1, 3))):
         done = 0
         for k in range(kills + 1):
             rows = stored(tmp_path / name)

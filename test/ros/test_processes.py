@@ -54,7 +54,7 @@ def wait(condition: Callable[[], bool], seconds: float = 40.0) -> bool:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes by /proc")
 def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
-    names = node_names()
+    names = repeats(node_names()[:2], node_names())
     command = [sys.executable, "-c", PARENT, str(tmp_path), *names]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
@@ -73,7 +73,7 @@ def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         assert "Traceback" not in log.read_text(), log.read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", repeats([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
 def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         for name in node_names():

@@ -14,6 +14,7 @@ import pytest
 from calib_planner_msgs.msg import CalibrationEstimate, PlanRequest
 from calib_planner_msgs.srv import PlanCalibration
 from poses import poses
+from robots import repeats
 
 from calib_planner import Robot
 from calib_planner.ros import demo
@@ -62,7 +63,7 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("measurements_*.csv"))) == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", repeats([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
 def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
         nodes.start("planner_node", {"starts": 5000})
@@ -126,7 +127,7 @@ def running_with(text: str) -> list[str]:
     return [line for line in lines if text in line]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", repeats([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
     command = [sys.executable, "-m", "calib_planner.ros.demo", "--output", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo_process:
