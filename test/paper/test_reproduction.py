@@ -25,6 +25,8 @@ from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, nu
 from calib_planner_paper.two_link import FIGURE_2, two_link_figure
 
 SETTINGS = ReproductionSettings(random_plans=2000, calibrations=repeats(40, 100), seed=1)
+POSES = repeats("AC", "ABC")
+"""Test poses of Table 2."""
 ERRORS = 4.5
 """Standard errors within which what is random has to be."""
 
@@ -34,7 +36,7 @@ def result() -> Reproduction:
     """With three starts per search, not up to 48, which find nothing better where it is hardest, at pose C."""
     told: list[float] = []
     module = sys.modules[reproduce.__module__]
-    poses = tuple(dataclasses.replace(pose, starts=3) for pose in module.TEST_POSES)
+    poses = tuple(dataclasses.replace(pose, starts=3) for pose in module.TEST_POSES if pose.name in POSES)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "TEST_POSES", poses)
         made = reproduce(SETTINGS, lambda share, text: told.append(share))
@@ -158,7 +160,7 @@ def test_plan_c_is_best_for_two_parameters_but_not_for_four(tables: Any) -> None
 COLUMNS = [(3, 1), (4, 1), (3, 4), (4, 3), (12, 1)]
 
 
-@pytest.mark.parametrize("name", ["A", "B", "C"])
+@pytest.mark.parametrize("name", POSES)
 def test_proposed_plans_and_bounds_of_table_2(name: str, tables: Any) -> None:
     table, robot = tables["table_2"], Robot.load("kuka_kr270")
     found, sigma = table["test_poses"][name], table["sigma"]
