@@ -114,7 +114,7 @@ def _read(document: Node) -> JointOrigins:
     required = ("format", "robot", "joints", "axes", "kinematics")
     document.mapping((*required, "tip"), required)
     joints = document["joints"].mapping().value
-    if not all(isinstance(name, str) for name in joints.values()):
+    if not all(isinstance(name, str) for pair in joints.items() for name in pair):
         raise document["joints"].refused("a mapping from entry to joint name")
     axes = document["axes"].mapping(joints, joints)
     entries = document["kinematics"].mapping((*joints, "hash"), (*joints, "hash"))
