@@ -96,6 +96,10 @@ def running(domain: int, folder: Path) -> Iterator[None]:
                     child.stdin.close()
 
 
+OPTIONAL = re.compile("/tf_static|/follow_joint_trajectory")
+"""Names that nodes offer where ``tf2_msgs`` and ``control_msgs`` are installed: left out everywhere."""
+
+
 class Watcher:
     """A node that asks the others what they offer."""
 
@@ -139,6 +143,8 @@ class Watcher:
         for item, value in zip(described.descriptors, got.values, strict=True):
             plain = parameter_value_to_python(value)
             choices = re.search(r"one of: ([^;]*)", item.additional_constraints)
+            if OPTIONAL.search(item.name):
+                continue
             found[item.name] = {
                 "type": type(plain).__name__,
                 "default": plain if isinstance(plain, (bool, int, float, str)) else list(plain),
@@ -158,7 +164,7 @@ class Watcher:
         from rclpy.action import get_action_server_names_and_types_by_node as action_servers
 
         node, who = self._node, (name, "/")
-        return {
+        every = {
             "publishers": {
                 topic: {"types": types, "qos": self._qos(node.get_publishers_info_by_topic(topic), name)}
                 for topic, types in node.get_publisher_names_and_types_by_node(*who)
@@ -172,6 +178,7 @@ class Watcher:
             "action_servers": dict(action_servers(node, *who)),
             "action_clients": dict(action_clients(node, *who)),
         }
+        return {kind: {k: v for k, v in names.items() if not OPTIONAL.search(k)} for kind, names in every.items()}
 
     def _qos(self, endpoints: Sequence[Any], name: str) -> list[str]:
         """Of the node's ends of a topic. How deep a queue is stays on its side; see parameters qos_overrides."""

@@ -30,7 +30,7 @@ def test_users_get_the_same(case: Case, inputs: Inputs, tmp_path: Path) -> None:
 def test_every_expected_file_has_its_case() -> None:
     names = [c.name for c in CASES]
     assert len(set(names)) == len(names)
-    assert {p.stem for p in EXPECTED.glob("*.json")} == {*names, "nodes", "interfaces", "arithmetic"}
+    assert {p.stem for p in EXPECTED.glob("*.json")} == {*names, "doors", "nodes", "interfaces", "arithmetic"}
 
 
 @pytest.mark.parametrize(
