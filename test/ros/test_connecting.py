@@ -16,7 +16,7 @@ from bench import Bench
 from geometry_msgs.msg import PointStamped
 
 from calib_planner.acquisition import NANO
-from calib_planner.io import config_folder
+from calib_planner.io import CELL_KEYS, config_folder
 from calib_planner.ros.messages import nanoseconds
 from calib_planner.ros.parameters import STREAM_IN
 from calib_planner.ros.settings import ExecutorParameters, IdentifierParameters, SimulatorParameters
@@ -56,8 +56,15 @@ def test_the_rehearsal_uses_parameters_that_exist() -> None:
     assert SimulatorParameters(**values).outlier_probability == 0.001
     known = yaml.safe_load((config_folder() / "simulator.yaml").read_text())["/**"]["ros__parameters"]
     assert {k: type(v) for k, v in values.items()} == {k: type(known[k]) for k in values}
-    others = {name for b in blocks if "/**" not in b for name in b}
+    others = {name for b in blocks if not {"/**", "required-accuracy"} & b.keys() for name in b}
     assert others <= {item.name for item in fields(IdentifierParameters)}
+
+
+def test_the_cell_has_keys_that_exist() -> None:
+    section = PAGE[PAGE.index("## One file, one launch") :]
+    (cell,) = re.findall(r"```yaml\n(.*?)```", section, re.DOTALL)[:1]
+    keys = yaml.safe_load(cell).keys()
+    assert len(keys) > 10 and keys <= CELL_KEYS.keys()
 
 
 # ── the tracker ──────────────────────────────────────────────────────────────────────────────────────
