@@ -65,7 +65,7 @@ IN_ROS: tuple[tuple[str, str], ...] = (
 """Pattern of an advice for the command line → what a user of the nodes does."""
 
 ESTIMATE_NUMBERS = ("condition", "sigma_estimate", "residual_rms_before", "residual_rms_after", "left_out_rms",
-                    "left_out_max", "left_out_predicted_rms")  # fmt: skip
+                    "left_out_max", "left_out_predicted_rms", "validation_rms", "validation_predicted_rms")  # fmt: skip
 """Numbers of an estimate that are not known while there is none."""
 PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency")
 """Fields of ``PlanQuality`` and of the message that are the same number."""
@@ -331,6 +331,7 @@ def estimate_to_message(estimate: Any, frame_id: str, **others: Any) -> Calibrat
         frame_id: The robot's base frame.
         others: Further fields (``plan_id``, ``condition``, …).
     """
+    held_out = estimate.validation
     numbers = {
         "nominal": estimate.fit.nominal,
         "value": estimate.fit.values,
@@ -354,6 +355,8 @@ def estimate_to_message(estimate: Any, frame_id: str, **others: Any) -> Calibrat
         "left_out_rms": float(estimate.left_out.rms),
         "left_out_max": float(estimate.left_out.max),
         "left_out_predicted_rms": float(estimate.left_out.predicted_rms),
+        "validation_rms": NAN if held_out is None else float(held_out.rms),
+        "validation_predicted_rms": NAN if held_out is None else float(held_out.predicted_rms),
         "terms": [term_message(t, t.used) for t in estimate.terms],
         "joint_names": list(estimate.calibrated.joint_names),
         "test_poses": rows_message(np.asarray(estimate.accuracy.test_poses, float)),

@@ -179,6 +179,7 @@ def test_estimate_there_and_back(robot: Robot, planned: Plan) -> None:
     data = cell.measure(planned.configurations, 2, 1)
     found = identify(IdentificationProblem(robot, data, test_poses=planned.test_poses))
     message = c.estimate_to_message(found, "base_link", plan_id="p", complete=True)
+    assert math.isnan(message.validation_rms) and math.isnan(message.validation_predicted_rms)
     assert message.header.frame_id == "base_link"
     assert message.status == CalibrationEstimate.STATUS_OK and message.complete
     assert len(message.covariance) == len(message.parameters) ** 2

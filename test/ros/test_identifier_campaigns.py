@@ -70,6 +70,7 @@ def test_two_campaigns_and_a_validation(shift: Shift, tmp_path: Path) -> None:
     assert last.value == fit.value and last.std == fit.std and last.header.stamp == fit.header.stamp
     assert any("held-out" in r.text for r in last.verdict.reasons)
     assert not any("held-out" in r.text for r in fit.verdict.reasons)
+    assert last.validation_rms > 0.0 and last.validation_predicted_rms > 0.0 and np.isnan(fit.validation_rms)
     rows = {"measurements_one-fit": 5, "validation_one-fit": 2}
     assert saved(shift, tmp_path) == rows
 
