@@ -22,7 +22,15 @@ ROS = {
         "rcl_interfaces",
         "sensor_msgs",
     ),
-    *("std_msgs", "std_srvs", "trajectory_msgs", "unique_identifier_msgs", "visualization_msgs", "rviz2"),
+    *(
+        "std_msgs",
+        "std_srvs",
+        "trajectory_msgs",
+        "control_msgs",
+        "unique_identifier_msgs",
+        "visualization_msgs",
+        "rviz2",
+    ),
 }
 """Packages of ROS 2 Jazzy: they are keys by their own names."""
 KEYS = {
@@ -36,7 +44,10 @@ KEYS = {
 }
 """Modules and their keys in rosdep's python.yaml that apt has on Ubuntu 24.04."""
 TEST_KEYS = {"ament_flake8", "python3-hypothesis", "python3-pytest", "python3-pytest-timeout"}
-EXTRAS = {"rosbags", "openpyxl", "xacro", "pinocchio", "dask", "distributed", "threadpoolctl", "shtab", "aiohttp"}
+EXTRAS = {
+    *("rosbags", "openpyxl", "xacro", "pinocchio", "dask", "distributed", "threadpoolctl", "shtab", "aiohttp"),
+    "moveit_msgs",  # MoveIt's users have it
+}
 """Nothing needs them: they are not in package.xml."""
 
 
