@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,11 +25,17 @@ from std_srvs.srv import Trigger
 pytest.importorskip("aiohttp", reason="the page needs aiohttp (extra page)")
 sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
 from browser import Browser, Tab, browser
+from desk import ASKED
 
+from calib_planner.ros.nodes.campaign import CampaignNode
+from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.page import PageNode
+from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED, SENSOR_OUT
 
 S = CampaignStatus
+IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAMES['campaign']}/plan", "keep_measurements": True}
+SIMULATOR = {"robot": "planar_2r", "error_model": "paper", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 
 
 class Others(Node):
@@ -204,8 +211,15 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 def until(bench: Bench, tab: Tab, expression: str, what: Callable[[Any], bool] = bool) -> Any:
     """Until an expression of the page has a value that is wanted; the value."""
-    bench.wait(lambda: what(tab.run(f"return {expression};")))
-    return tab.run(f"return {expression};")
+    values: list[Any] = []
+
+    def there() -> bool:
+        time.sleep(0.05)  # between two looks: each costs the browser, too
+        values.append(tab.run(f"return {expression};"))
+        return what(values[-1])
+
+    bench.wait(there)
+    return values[-1]
 
 
 def text(name: str) -> str:
@@ -280,6 +294,52 @@ def test_a_campaign_by_clicks_alone(
     assert tab.problems == []
     own = page.url.rstrip("/")
     assert {u.rpartition(":")[2].partition("/")[0] for u in tab.requests} == {own.rpartition(":")[2]}
+
+
+def test_a_campaign_of_the_real_nodes_by_clicks_alone(bench: Bench, chromium: Browser, tmp_path: Path) -> None:
+    """Start, look at the plan, leave one out, resume, pause, resume; then the verdict and the report."""
+    bench.start(SimulatorNode, **SIMULATOR)
+    bench.start(IdentifierNode, **IDENTIFIER, save_folder=str(tmp_path))
+    bench.start(CampaignNode, **(ASKED | {"review": True}))
+    page = bench.start(PageNode, port=0, executor="tracker_simulator", report_folder=str(tmp_path))
+    tab = chromium.open(page.url, 360, 740)
+
+    def press_in_page(name: str) -> str:
+        """Press a button as soon as it can be; the answer."""
+        until(
+            bench,
+            tab,
+            f"document.querySelector('[data-do={name}]').getAttribute('aria-disabled')",
+            "false".__eq__,
+        )
+        label = tab.run(f"return document.querySelector('[data-do={name}] b').textContent;")
+        click(tab, f"[data-do={name}]")
+        if tab.run("return document.getElementById('sure').open;"):
+            click(tab, "#sure-yes")
+        return str(until(bench, tab, text("answer"), lambda t: t.startswith(f"{label}: ")))
+
+    assert "begun" in press_in_page("start")
+    until(bench, tab, text("badge"), "review".__eq__)
+    ahead = "[...document.querySelectorAll('#ahead .name')].map((e) => e.textContent)"
+    numbers = until(bench, tab, ahead, lambda names: len(names) > 2)
+    click(tab, "#ahead li:nth-child(2) .act")
+    left = until(bench, tab, ahead, lambda names: numbers[1] not in names)
+    assert tab.run(f"return {text('readout-3d')};").startswith(f"Configuration {left[0]}, ahead")
+    assert press_in_page("resume").endswith("goes on")
+    until(bench, tab, text("badge"), "measuring".__eq__)
+    until(bench, tab, "document.querySelectorAll('#residuals circle').length", lambda n: n >= 1)
+    assert press_in_page("pause").startswith("Pause: paused")
+    until(bench, tab, text("badge"), "paused".__eq__)
+    press_in_page("resume")
+    until(bench, tab, text("badge"), "done".__eq__)
+    assert until(bench, tab, text("level")) in ("PASS", "WARN")
+    assert "required accuracy is reached" in tab.run(f"return {text('title')};")
+    measured = tab.run("return document.querySelectorAll('#done li[data-key]').length;")
+    assert measured == len(page._state.visits) >= 6
+    assert "report written" in press_in_page("report")
+    link = until(bench, tab, "document.getElementById('report-link').href", lambda href: "/report/" in href)
+    assert chromium.open(link).run("return document.title;").startswith("Calibration of planar_2r")
+    assert tab.problems == []
 
 
 def test_texts_from_topics_are_never_markup(

@@ -231,7 +231,7 @@
     for (const item of document.querySelectorAll(".list li")) item.classList.toggle("chosen", Boolean(row) && item.dataset.key === row.key);
     let said = "";
     if (row && row.word) said = `Measurement ${row.number}, ${row.word}, residual ${row.residual}: ${words(row.joints)}. ${row.reason}`;
-    else if (row) said = `Configuration ${row.number}, ${row.note || "ahead"}: ${words(row.joints)}.`;
+    else if (row) said = `Configuration ${row.number}, ${row.note === "now" ? "now" : ["ahead", row.note].filter(Boolean).join(", ")}: ${words(row.joints)}.`;
     byId("readout-3d").textContent = said;
   }
 
