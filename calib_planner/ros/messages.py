@@ -65,18 +65,15 @@ IN_ROS: tuple[tuple[str, str], ...] = (
 """Pattern of an advice for the command line → what a user of the nodes does."""
 
 ESTIMATE_NUMBERS = ("condition", "sigma_estimate", "residual_rms_before", "residual_rms_after", "left_out_rms",
-                    "left_out_max", "left_out_predicted_rms", "validation_rms", "validation_predicted_rms")  # fmt: skip
+                    "left_out_max", "left_out_predicted_rms", "validation_rms",
+                    "validation_predicted_rms")  # fmt: skip
 """Numbers of an estimate that are not known while there is none."""
 PLAN_NUMBERS = ("predicted_accuracy", "lower_bound", "efficiency")
 """Fields of ``PlanQuality`` and of the message that are the same number."""
 PURPOSE = {FIT: PlanMessage.FIT, VALIDATION: PlanMessage.VALIDATION}
 LEVELS = {"PASS": VerdictMessage.PASS, "WARN": VerdictMessage.WARN, "FAIL": VerdictMessage.FAIL}
 MEASUREMENT_STATUS = {
-    word: getattr(
-        Measurement,
-        word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}",
-        Measurement.REJECTED_NOT_FINITE,
-    )
+    word: getattr(Measurement, word.upper() if word == ACCEPTED else f"REJECTED_{word.upper()}")
     for word in DECISIONS
 }
 
