@@ -183,7 +183,8 @@ IRB = SHARED_DATA / "irb120_tracker"
 
 @pytest.mark.skipif(not IRB.is_dir(), reason="the measured data are not here")
 @pytest.mark.parametrize(
-    ("level", "rank", "most"), repeats([("full", 51, 0.145e-3)], [("offsets", 21, 0.57e-3), ("full", 51, 0.145e-3)])
+    ("level", "rank", "most"),
+    repeats([("full", 51, 0.145e-3)], [("offsets", 21, 0.57e-3), ("full", 51, 0.145e-3)]),
 )
 def test_irb120(call: Any, level: str, rank: int, most: float) -> None:
     """ABB IRB 120 before a tracker: 40 poses that took no part in the fit, better than by plain least squares.

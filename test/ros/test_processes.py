@@ -136,7 +136,10 @@ def test_ctrl_c_several_times_ends_all_nodes_with_status_0(tmp_path: Path, seed:
                 os.kill(nodes.processes[name], signal.SIGINT)
         assert nodes.end(signal.SIGINT) == dict.fromkeys(names, 0), nodes.logs()
     for log in logs.values():
-        assert "Traceback" not in log.read_text() and "[ERROR]" not in log.read_text(), log.read_text()
+        lines = log.read_text().splitlines()
+        wrong = [line for line in lines if "Traceback" in line or "[ERROR]" in line]
+        # The executor starts without control_msgs, and says so.
+        assert not [line for line in wrong if "control_msgs is not installed" not in line], lines
 
 
 def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
