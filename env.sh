@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 # Source this file (bash or zsh, from any folder) for a shell in which python, calib-planner and the
 # nodes of this checkout run. Prepared by `make setup`.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Package of the library, its command line and its ROS 2 nodes (ament_python).
 
 *The interfaces* are a package of their own in ``msg_defs``, since an ament_python package cannot generate any.

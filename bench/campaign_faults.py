@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every fault of the simulated shop floor × seeds, through the nodes: simulator, identifier and campaign.
 
 What ``fault_matrix`` does in virtual time happens here as it does in a cell: three processes, their messages and

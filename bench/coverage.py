@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Does the identification know how sure it is, and what does not belong? Simulated cells, many seeds.
 
     python bench/coverage.py [--sections coverage outliers breakdown scales] [--cases WORD …] [--seeds 500]

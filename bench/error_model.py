@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The error model on measured and on simulated robots: what is predicted and what is achieved.
 
     python bench/error_model.py [--data ../shared/data] [--seeds 20] [--simulated 20] [--kinds WORD …]

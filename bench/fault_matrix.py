@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every fault of the simulated shop floor × seeds: is the verdict right, or at least honest?
 
 One run is a campaign in virtual time, without ROS: a robot with drawn errors visits a plan, its messages go

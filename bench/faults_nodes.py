@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every fault of the simulated shop floor × seeds, and some pairs, through the nodes on a simulated clock.
 
 What ``fault_matrix`` does without nodes and ``campaign_faults`` in real time happens here in ``lockstep``: the

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """FIGAROH's geometric calibration, in an interpreter that has it.
 
     python figaroh_identification.py ROBOT.urdf FOLDER

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """FIGAROH's choice from a pool, in an interpreter that has it: ``python figaroh_socp.py POOL.npz``.
 
 ``POOL.npz`` holds ``rows`` (C, 3, p), the base regressor of each candidate. FIGAROH 1.0.2 (figaroh.optimal,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plans for robots that err otherwise than the plan assumes, against random choices, by the default estimator.
 
     python bench/half_and_double.py [--seeds 6] [--random 100] [--counts 10 15 20 30] [--json FILE]

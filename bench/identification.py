@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Identification: speed and held-out error against FIGAROH. (Measured robots: bench/error_model.py.)
 
     python bench/identification.py [--sections figaroh kuka] [--figaroh PYTHON] [--data ../shared/data]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Positions + identification Jacobian of the KR-270, poses per second beside Pinocchio's from Python.
 
 Pinocchio: forwardKinematics + computeJointKinematicRegressor per configuration, called in a Python loop on the

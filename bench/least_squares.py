@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Identification beside a plain ``scipy.optimize.least_squares``: the same robots, rows and held-out rows.
 
     python bench/least_squares.py [--data ../shared/data] [--seeds 5] [--simulated 5] [--json FILE]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The page of ``calibration_page``: first paint, and how soon an update is seen, with 20 clients, some slow.
 
     python bench/live_page.py [--updates 200] [--clients 20] [--idle 5] [--visits 60]

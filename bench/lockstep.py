@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Nodes in one process on a simulated clock that waits for them: as fast as they work, and the same every time.
 
 The nodes run as users run them with ``use_sim_time``: their own code, messages, services, actions and DDS between

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How many random visits, and how many minutes, are as good as 15 planned ones?
 
     python bench/minutes.py [--data ../shared/data] [--seeds 6] [--robots NAME …] [--share 0.3]

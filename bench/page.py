@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/benchmarks.md and its pictures from the benches' results.
 
     python bench/page.py [--results results] [--run] [--figaroh PYTHON]

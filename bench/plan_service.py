@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What asking the planner node costs beside planning: the service's answer against the library's call.
 
     python bench/plan_service.py [--requests 30]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How near the bound the planner comes, and in what time: kuka_kr270, nine parameters, default settings.
 
 50 random test poses within the joint limits; for each number of configurations the distribution of the efficiency

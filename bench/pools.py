@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """D-optimal choice from a pool of real configurations, against FIGAROH's SOCP, in one run.
 
     python bench/pools.py [--data ../shared/data] [--json FILE] [--figaroh PYTHON] [--sizes 500 2000]

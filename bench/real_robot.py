@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plans on a measured UR10 against random choices of the same rows, same estimator, same held-out data.
 
     python bench/real_robot.py [--data ../shared/data] [--seeds 6] [--pool 600] [--random 100] [--others]

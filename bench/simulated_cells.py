@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated cells for the benches: everything drawn from a seed, wrong in the ways that a case says.
 
 How the robot errs is drawn from the error model (``error_model.Truth``). Gross errors come on top: 10–50 mm, in

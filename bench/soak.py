@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Soak of the identifier node: joint states and tracker points at 1 kHz each, for minutes, none may be lost.
 
     python bench/soak.py [--minutes 10] [--rate 1000] [--stored 200] [--period 3]

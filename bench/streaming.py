@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The estimate brought up to date one visit at a time: time of an update, and how far it is from a full fit.
 
     python bench/streaming.py [--updates 12] [--counts 20 50 100 200 400]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Robot calibration with a laser tracker: where to measure, and what the measurements say.
 
 ``Robot`` → ``PlanProblem`` → ``plan`` → ``Plan``;

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m calib_planner`` is ``calib-planner``."""
 
 import sys

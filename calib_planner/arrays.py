@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The only gatekeepers for arrays: each ``check_*`` returns the canonical, read-only float64 copy.
 
 Inner code assumes that what passed here is clean: right shape, finite, C-ordered, immutable.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Corrected joint targets, for a controller that cannot change its model.
 
 The controller believes in the nominal robot: at joint angles q it takes the tool to be at the pose T_nom(q). The

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The demonstration without ROS: plan, measure in simulation, identify, compare with the truth and with chance.
 
 The robot errs as real ones do: in its parameters, under gravity, by its joints' own functions, and a little anew

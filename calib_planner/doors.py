@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Doors whose names are imported when they are first used, so that a program pays only for what it needs.
 
 A room's ``__init__`` lists its names twice: under ``TYPE_CHECKING`` as imports, for type checkers and editors,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """One root for everything this package refuses, so that a caller needs one ``except``.
 
 Every child carries its data as attributes (never only as prose) and its text says four things: which

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What was measured: joint values, the points that the tracker saw there, and points that are not believed."""
 
 from __future__ import annotations

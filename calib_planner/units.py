@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Numbers, lists and foreign texts as people read them: the one place where a value becomes words.
 
 Values come in SI units and radians and go out in the unit that a person at a robot uses. Texts that came from a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How Sphinx makes docs/: Markdown pages, the Python reference from the docstrings. No page needs a network."""
 
 from calib_planner import __version__

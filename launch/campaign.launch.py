@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts all that a real cell needs for a campaign: planner, identifier, executor, campaign and page.
 
     ros2 launch calib_planner campaign.launch.py cell:=cell.yaml

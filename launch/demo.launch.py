@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts planner, identifier and simulated tracker; then ask for a plan and have it executed.
 
     ros2 launch calib_planner demo.launch.py robot:=kuka_kr270 seed:=1 save_folder:=$HOME/calibration rviz:=true

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts plan_executor with config/executor.yaml: it moves a real robot by a FollowJointTrajectory controller.
 
     ros2 launch calib_planner executor.launch.py robot:=ur10e

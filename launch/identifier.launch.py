@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts calibration_identifier with config/identifier.yaml.
 
     ros2 launch calib_planner identifier.launch.py store_folder:=$HOME/calibration

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts calibration_planner with config/planner.yaml, and RViz with rviz:=true.
 
     ros2 launch calib_planner planner.launch.py

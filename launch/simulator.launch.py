@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts tracker_simulator with config/simulator.yaml.
 
     ros2 launch calib_planner simulator.launch.py

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Makes ``robots`` and the tools importable from every test folder; the nodes' tests, which wait, come first."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The examples of a Markdown page, run in their order as one shell session in a folder that is like a checkout.
 
     ```bash run        commands that a reader can copy: every one must succeed

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Processor time of the tests by room, printed at the end of a run (a pytest plugin, also with pytest-xdist).
 
 Every report of a test carries the processor time that its process and the ended children of that process used

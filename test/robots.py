@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Robots that the tests share: the shipped ones and a URDF with every kind of joint."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Compensation: the true robot, told the corrected targets, has its tool where the nominal one says.
 
 The oracle is the product of 4×4 matrices, element by element, not the code under test.

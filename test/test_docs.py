@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every example of README and docs/ runs as it stands and prints what it promises; references are current."""
 
 from __future__ import annotations

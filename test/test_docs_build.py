@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """docs/ builds without a warning, every link leads to a page and a heading, and no page needs a network."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """package.xml, setup.py and the linters' configuration say what the code needs and offers."""
 
 from __future__ import annotations

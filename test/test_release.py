@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a release needs: one version everywhere, and the header of every source file."""
 
 from __future__ import annotations
@@ -47,3 +49,7 @@ def test_the_picture_of_the_rooms_is_what_the_page_and_the_test_say() -> None:
     assert page == {room: set(uses.split()) for room, uses in ROOMS.items()}
     assert room_picture.drawn(page) == room_picture.PICTURE.read_text(encoding="utf-8"), "tools/room_picture.py"
     assert room_picture.nearest({"a": set(), "b": {"a"}, "c": {"a", "b"}})["c"] == {"b"}
+
+
+def test_every_source_file_has_the_header() -> None:
+    assert not [p for p in headers.sources() if headers.with_header(p, p.read_text()) != p.read_text()]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The house: which room may use which, doors between them, no cycles, ROS in one room, one word for one thing.
 
 docs/architecture.md describes the rooms and their direction, docs/glossary.md the words. Imports inside functions

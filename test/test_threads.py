@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Linear algebra keeps to one thread while we compute, and to what it was before and after."""
 
 from __future__ import annotations

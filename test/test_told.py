@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What problems, results, robots and measurements say of themselves: one line, and a table in a notebook."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A workspace with this checkout below ``src``: the ordinary command builds the package and its interfaces.
 
 The interfaces of the copies here are one small service, since a build of all takes a minute.

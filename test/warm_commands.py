@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner`` and ``python SCRIPT`` without the time of their imports, for pages of many commands.
 
 A process that has imported the package forks once per command. The command gets the caller's streams, folder and

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Say what is missing in this environment, one line each; exit status 1 if anything is.
 
 ``make setup`` asks before it says "ready". The stamps that it keeps tell what was done once, not that it is still

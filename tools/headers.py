@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The two lines about copyright and licence at the top of every source file.
 
     python tools/headers.py            print the files without them; status 1 if there are any

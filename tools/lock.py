@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Print the exact version of everything pip put into this interpreter's environment.
 
 Run with Python 3.10's environment, whose versions also install on 3.11 and 3.12:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Print the pins of a constraints file for packages that this interpreter does not have yet.
 
 Used with a sourced ROS: what the system already provides (numpy above all) must stay as it is.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Mutation testing of the formulas: change one operator or number at a time, and see whether a test fails.
 
     python tools/mutation.py [--sample N] [--seed S] [--report FILE] [FILE …]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Make the ROS wheels' exported CMake files name this environment's folders.
 
 The wheels name the include folders of the machine that built them. Run with the environment's own

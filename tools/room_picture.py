@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Draw the rooms of docs/architecture.md: docs/pictures/rooms.svg, from the table of that page.
 
     python tools/room_picture.py [FILE]

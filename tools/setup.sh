@@ -1,4 +1,6 @@
 #!/usr/bin/env bash
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 # Set up this checkout: .venv with all packages, the interfaces in install/, the library in .venv.
 # Idempotent: each step keeps a stamp with a hash of what it depends on. Called by `make setup`.
 #   PYTHON=/path/to/python3.12 make setup     chooses the interpreter

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The version of both packages, in every file that states it.
 
     python tools/version.py            print it; status 1 and the files if they do not agree

@@ -1,4 +1,6 @@
 #!/usr/bin/env bash
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 # Builds the wheel and uses it without ROS in a fresh environment of every Python 3.10 … 3.13 that is there,
 # on the PATH or from pyenv. Says which were tried and which are missing. Usage: tools/wheel.sh [3.12 …]
 set -euo pipefail

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """From streams of joint states and tracker points to standstills: stamps, clocks and intake.
 
 docs/glossary.md explains the words.

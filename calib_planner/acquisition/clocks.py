@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Do the clocks of joints and points agree? Seen from when each came to rest and when it moved on.
 
 A standstill is an interval [a, b] in the stamps of the joints and [a', b'] in those of a target. A clock that is

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """From messages to standstills: one intake for the topics of a node and for the messages of a recording.
 
 Only the stamps in the headers count. Several publishers may share the robot's joints, on one topic or on

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is read out of the messages of drivers, the same for the topics of a node and for a recording.
 
 A message is anything with the fields of its type: those of rclpy and those that rosbags decodes are alike.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rests of streams: the samples since a stream came to rest, and the rest of joints that come in parts.
 
 A ``RestWindow`` is the rest of one stream. The joints of a robot may come in parts, each in messages of its own

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Puts messages of several streams in the order of their stamps, with bounded delay and memory.
 
 A message waits until no earlier one can come any more: until every stream has been heard that far plus the

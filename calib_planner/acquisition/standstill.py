@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """When does the robot stand still, and what are the mean joints and points then?
 
 Still means: over an interval, max − min of every joint and of every coordinate of every point stays within a

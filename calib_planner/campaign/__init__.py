@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Measuring as long as it takes: plan, measure, identify, plan the rest from what was measured, validate.
 
 docs/glossary.md explains the words.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the measurements of a campaign say: how large the error at the test poses is, and what of it will stay.
 
 The error of a visit to a test pose has two parts. What is not known of the robot, (M3), falls with the

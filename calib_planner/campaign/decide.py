@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """After a batch: identify, and stop or plan the next one. Seconds of work; the state it is about does not change.
 
 For the fit, in this order:

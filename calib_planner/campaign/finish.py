@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The end of a campaign: configurations held out of the fit, what they say, the verdict and the result.
 
 *Where to validate.* The user wants to know the error where the robot will work, so the test poses come first, as

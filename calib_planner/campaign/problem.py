@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The problem and the result of a campaign: which accuracy, how much may be measured, and how it ended.
 
 Where the robot could not be measured, a neighbourhood of the configuration is given up with it. Around a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A campaign from beginning to end, for whoever can measure one configuration at a time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A campaign as a value: what was planned, what was measured, what failed; events in, the next action out.
 
 Nothing here computes: ``next_action`` and the events take microseconds, so that whoever moves the robot always

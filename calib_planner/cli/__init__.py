@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The command line ``calib-planner``: arguments in, one library call, result out. No ROS.
 
 ``main`` runs a command, ``parser`` is the parser of all commands. The other names are for commands of other

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Arguments that several commands share, and how their text becomes numbers and robots."""
 
 from __future__ import annotations

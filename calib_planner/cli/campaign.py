@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner campaign``: measure until it is accurate enough, by hand round by round or in simulation."""
 
 from __future__ import annotations

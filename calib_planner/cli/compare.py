@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner compare``: the proposed plan beside random ones, the paper's Table 2."""
 
 from __future__ import annotations

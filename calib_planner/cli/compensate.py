@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner compensate``: joint targets corrected for a controller that cannot change its model."""
 
 from __future__ import annotations

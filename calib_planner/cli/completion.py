@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner completion``: the script that lets a shell complete commands, options and files.
 
 The script is a table of all commands and options, written once by shtab and read by the shell alone. The other

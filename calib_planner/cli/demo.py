@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner demo``: the whole way in simulation, without ROS."""
 
 from __future__ import annotations

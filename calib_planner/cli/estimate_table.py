@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """An estimate for people: the verdict with reasons, before → after, predicted against achieved, then details.
 
 Long lists are cut; the files and ``--json`` hold all of it.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner export``: everything that can be made of an estimate file, without another fit."""
 
 from __future__ import annotations

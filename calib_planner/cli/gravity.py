@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """--payload, --mounting and --vertical: what hangs on the joints, and which way is down."""
 
 from __future__ import annotations

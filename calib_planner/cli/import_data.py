@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner import``: measurements of any layout as this package's own CSV."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner init``: ask what a cell has, try it on measurements, and write ``cell.yaml``."""
 
 from __future__ import annotations

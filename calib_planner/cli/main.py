@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The parser over all commands, and what every command does with errors, Ctrl-C and a closed pipe.
 
 A command is a module with ``add(commands, summary)``, which adds its parser, and ``run(args, terminal)``, which

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner program``: a plan as the program of a robot's controller."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner robots``: which robots there are, and what each has."""
 
 from __future__ import annotations

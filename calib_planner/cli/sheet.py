@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner sheet``: a plan as the person at the robot needs it — page, tables, trajectory."""
 
 from __future__ import annotations

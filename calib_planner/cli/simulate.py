@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner simulate``: measure a plan with a simulated robot and tracker."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a command may say and where: the answer on stdout, everything else on stderr."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is said about a command line that cannot be understood: which word, what is valid, what was meant.
 
 ``argparse`` reports the first thing that it stumbles over, which is often not the fault: a mistyped ``--robt`` as

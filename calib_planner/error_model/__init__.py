@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How robots err: one file a term, ``ErrorModel`` that composes them, and ``Knowledge`` that predicts.
 
 docs/glossary.md explains the words.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Elasticity: the joints give way under the weight of the arm.
 
 A mass at p_m that hangs on the links behind joint l turns that joint, with axis w_l through o_l, by a moment

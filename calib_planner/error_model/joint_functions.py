@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors of each joint's own transmission and encoder: a function of that joint's angle alone.
 
 Gears, couplings and encoders turn joint l by φ_l(q_l) more than it says, the same each time. A point moves by

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is known of a robot, and how well: (M2), (M3) and the prediction of any point.
 
 Measuring the configurations q_i gives, with the columns J⁺ of parameters and other coefficients β, their prior

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How a robot and its measurement err: the terms together, (M1).
 
 For configuration i and target t, with J⁺ = [∂g/∂Π, B] and β = (ΔΠ, u),

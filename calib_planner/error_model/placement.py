@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the parts of the robot, its base and its targets are: the parameters of the chain, eq. (1)–(3).
 
 The columns are those of the identification Jacobian, ∂g/∂Π. What is known of a parameter before the data is a

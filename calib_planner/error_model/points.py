@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is new at each point: the instrument's noise and a floor.
 
 The instrument says how it errs in each direction, a covariance Σ_it that depends on where the point is

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Configurations with everything that the terms of the error model need of them, computed once.
 
 A joint that reads q_l stands at q_l + δ_l, where the deflection δ comes from the elastic term and the joint

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a user knows of the parameters before the data: a normal distribution, Π_k ~ N(m, C).
 
 It comes from a file, or from an estimate before. A prior adds equations to the least squares (maximum a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The error model as plain data, for YAML: alone or as a part of an estimate.
 
 ``to_mapping`` gives dictionaries, lists, numbers and strings; ``from_mapping`` reads them back to an equal model

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot drawn from its error model: what a simulation measures, and what an estimate should find.
 
 With everything known, (M1) says where the targets are. The joints that read q stand at q + δ(q; u) + h_i, with

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is expected of a robot that nobody has measured: all terms, at sizes that measured robots have.
 
 The sizes are those of measured industrial robots: of each scale the median, and the factor that one standard

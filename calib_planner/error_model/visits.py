@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is new at each visit and the same for all targets seen there.
 
 A joint does not come back to exactly where it was: at visit i the joints err by h_i ~ N(0, σ_j² I), and the

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the measurements say: a problem, the verb ``identify``, the estimate, its validation and verdict.
 
 docs/glossary.md explains the words.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Does one single change to what was assumed explain the measurements far better? One table of such changes.
 
 An *alternative* is a change of one assumption: the tracker stood still, the points are in metres, joint 4

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Points and runs of visits that the others find impossible lose weight: their variance grows.
 
 The judge of a point is its left-out residual (M4), which its own weight does not touch. A doubtful point gets a

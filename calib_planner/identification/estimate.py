@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The answer of the identification: parameters, what else was learnt, how sure, and what the residuals say.
 
 An ``Estimate`` is made by ``identify`` and completed by ``validate``. Its parts are frozen values of their own:

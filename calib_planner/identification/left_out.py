@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the model says of measurements that it has not seen: left-out residuals in closed form, (M4).
 
 A *group* is all visits at one configuration: repetitions would tell each other what the model has to say. With

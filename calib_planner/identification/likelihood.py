@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The linear problem of one relinearisation: generalised least squares and the restricted likelihood.
 
 With the flat columns F (base, targets, and placement where its prior is flat), all other columns B with

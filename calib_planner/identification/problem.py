@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identification problem: a robot, its measurements, how both err, and what is wanted."""
 
 from __future__ import annotations

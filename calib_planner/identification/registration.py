@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the tracker stands and where the targets sit, in closed form: no initial guess.
 
 With the tip at rotation R_i and position o_i in the base frame, a target at t in the tip's frame is seen at

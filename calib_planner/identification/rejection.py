@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What probably happened to points that were rejected, and rows that cannot be measurements.
 
 A rejected point that fits the prediction of another row or of another target was exchanged with it. If all points

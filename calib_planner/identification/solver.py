@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Identification, from a problem to its estimate.
 
 1. start      Base and targets, where they are unknown, in closed form (``registration``).

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What each term of the error model brings: its size at the tool, and what it gains.
 
 A term with columns moves the measured points by B û; of the joint functions a component has the share of û that

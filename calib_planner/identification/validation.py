@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Does the calibrated robot predict poses that took no part in the fit, and as well as it said it would?
 
 At a held-out point measured − predicted should scatter like the covariance that ``Knowledge.predict`` gives. If

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Is this calibration good? PASS, WARN or FAIL, with reasons that a person can act on.
 
 Every reason has a level of its own; the verdict is the worst of them. A reason at level PASS is information and

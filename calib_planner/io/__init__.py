@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files in and out: robots, measurements, plans, estimates, priors, constraints, bags and stored campaigns.
 
 Importing this room teaches ``Robot.load`` to read files; every other file is imported when it is first used.

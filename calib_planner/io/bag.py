@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Measurements out of a rosbag2 recording: joint states and tracker points, paired where the robot stood still.
 
 A bag is a folder with ``metadata.yaml``, a folder of storage files whose recorder never wrote that, or one

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """One file for one cell: the robot, what it carries, where the reflectors sit, the instrument, what is unknown.
 
 ``cell.yaml`` says once what every command needs. Its keys are the names of the options; a value is what the

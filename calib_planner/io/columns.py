@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the columns of a table mean, told by their names, and the units that stand with them.
 
 A name is taken apart into its unit, if one stands with it (``x [mm]``, ``q1_deg``, ``z/m``), and the words of

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What may be measured and with which instrument, as YAML that users write; every section may be left out.
 
 Constraints; config/constraints.yaml shows every key:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tables of joint configurations and of measurements as CSV, as this package writes them: exact to the bit.
 
 A configuration has a column per joint [rad | m], and ``repetitions`` if that is given. Measurements have the

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The one door for measurements and for tables of configurations, whatever kind of file they come in."""
 
 from __future__ import annotations

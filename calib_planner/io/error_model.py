@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Error models as files: what is expected of a robot that nobody has measured, and what an estimate has learnt.
 
 A model is saved alone (``write_error_model``); its mapping is the same inside an estimate.

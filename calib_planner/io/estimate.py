@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Estimates as YAML: the keys are those of ``identify --json``, and what it takes to rebuild the robot.
 
 What is written comes back to the bit, and writing what was read gives the same file. A number that is unknown

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What kind of file a table is: told by its first bytes, since names lie; and what to do about kinds that are
 none.
 

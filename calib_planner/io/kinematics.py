@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A calibration as kinematics YAML in the convention of Universal Robots: xyz and rpy per joint, and a hash.
 
     format: calib_planner/kinematics

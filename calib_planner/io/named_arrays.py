@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Arrays under names as raw lines: NPY, NPZ, MAT and JSON.
 
 All four hold arrays with a row per visit, some with names. An array of one column is a column of that name. One

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plans as YAML, and plan sheets as CSV, YAML and trajectory; all exact to the bit.
 
 *The CSV* of a sheet has a row per visit. Joint columns bear the joints' own names and are in rad or m, and there

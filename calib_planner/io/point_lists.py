@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Points in files of their own, as trackers export them, and the rows of joints that they belong to.
 
 A list of points has x, y and z, and a name or a time where it has one; each target has a list of its own, or

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is known of the parameters beforehand, as YAML that a user writes or as an estimate from before.
 
     source: last year's calibration        # in words; may be left out

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identification problem that an estimate answers, as a part of its file.
 
 An estimate is applied weeks later and on other computers. Its file therefore holds the measurements and the

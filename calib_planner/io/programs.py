@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Robot programs that visit a plan: the text that a maker's controller loads, from a template.
 
 A template is one file, ``config/programs/NAME.j2`` or the user's own, in the language Jinja2. It begins with a

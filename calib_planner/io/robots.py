@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Robots from files: those that come with the package, users' URDFs, and users' YAML files.
 
 A robot YAML holds the chain of eq. (2) element by element:

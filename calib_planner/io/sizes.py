@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Units told by the sizes of numbers alone, where nothing is written and nothing is stated; and those of options.
 
 Sizes are trusted only where they leave one reading:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files of measurements read together: one set of rows, and where each row came from."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a session and a campaign leave on disk: nothing that was acknowledged is ever lost.
 
 *The store* of an identifier, ``campaign.sqlite`` in a folder that the user chose; without a folder the same in

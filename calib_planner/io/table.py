@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A table out of raw lines: where its header and its rows are, what separates the cells, and which decimal mark.
 
 *Separator.* A semicolon, tab or bar that stands equally often in the lines of numbers is one. Else it is a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Text in and out of files: bounded reading, atomic writing, typed errors."""
 
 from __future__ import annotations

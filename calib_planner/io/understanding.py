@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """From a table to numbers in SI units, and what was recognised on the way.
 
 A file becomes a table (``table.py``), the table's columns get a meaning (``columns.py``), and here the cells

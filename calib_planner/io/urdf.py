@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """URDF in and out: the chain between two links as a robot, its speed limits, and a calibrated URDF.
 
 *Reading.* Each joint of the chain becomes ``Tx Ty Tz · Rz Ry Rx`` (its origin, with six placement errors named

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a URDF says of links and joints, and which chain of them is the robot.
 
 Only links and joints of the chain matter. Whatever else is wrong in a file does not stop the calibration of the

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The text of a URDF, expanded by xacro where it has to be.
 
 xacro is the macro language in which most descriptions of robots are written. The Python package of that name

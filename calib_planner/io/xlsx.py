@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Spreadsheets (XLSX) as raw lines: the values that the cells show, with a tab between them."""
 
 from __future__ import annotations

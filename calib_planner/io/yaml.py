@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The one reader and the one writer of this package's YAML files.
 
 A file holds mappings, lists and plain values. A ``Node`` is one of them that knows its file and the keys that

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where to measure: a plan problem, the verb ``plan``, the plan, and how good it provably is.
 
 docs/glossary.md explains the words.

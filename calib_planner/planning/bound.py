@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How good could any plan be? An upper bound on its value Ψ from the best approximate design.
 
 Let an *approximate design* be a probability measure ξ in place of "m visits, each to one configuration, with r

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How many measurements, how to split them between configurations and repetitions, and what fits into a time.
 
 *Measurements.* With σ_c = 0 the accuracy of k configurations measured r times is ρ_k/√r, and the bound of n

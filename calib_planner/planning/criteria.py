@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What plans are compared by: information functions of the information matrix M (Pukelsheim, Optimal Design of
 Experiments, 1993).
 

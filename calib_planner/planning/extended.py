@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a set of configurations tells when the robot errs as an error model says: (M1), (M2).
 
 Measuring configuration q gives, with c_l = ∂p/∂q_l and the moments τ of gravity,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which configurations may be measured at all, and how far they are from the edge of what is allowed.
 
 A constraint has a name and says, for a batch of configurations, which of them it allows. Most of them are

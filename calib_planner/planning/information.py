@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a set of configurations tells about the parameters: the information matrix of eqs. (10) and (11).
 
 Measuring configuration q r times gives, with the point covariance Σ(p) of the instrument and an error of the

@@ -1,3 +1,5 @@
+/* Copyright 2026 calib_planner contributors */
+/* SPDX-License-Identifier: Apache-2.0 */
 /* How configurations share the errors of their joints, without an array call per joint; see extended.py.
  *
  * With levers c (N, rows, joints), N = S·m configurations in S runs of m, and kernels κ (joints, S, m, m),

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Work in parts, here or by any ``concurrent.futures`` executor.
 
 The parts depend on the problem only, never on the executor, and a random part has a seed of its own. So the same

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The verb: ``plan(problem)`` → ``Plan``. Prepare, bound, search, prove what was reached.
 
 The approximate design comes first: it gives the bound, and its support is where good plans are. Then the

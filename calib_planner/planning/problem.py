@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The request to the planner: a robot, where accuracy matters, and how much may be measured."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's baseline: how do random plans fare beside the proposed one? (Table 2)"""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The planner's answer: what to measure (``Plan``), and how good that provably is (``PlanQuality``)."""
 
 from __future__ import annotations

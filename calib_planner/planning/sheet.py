@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The plan sheet: all that the person at the robot needs to measure a plan, and nothing that was not checked.
 
 The visits are the plan's configurations in the plan's order. Everything else is checked (``check_visits``) or

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The order of the visits, how far the joints travel from visit to visit, and how long the tour takes.
 
 ``visiting_order`` sorts the same configurations for little joint travel between them, or for little time.

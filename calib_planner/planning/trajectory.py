@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The way between configurations as a controller gets it: joint positions and velocities at times.
 
 Between rests all joints move together along s(τ) = 10τ³ − 15τ⁴ + 6τ⁵, τ from 0 to 1 over the time that ``Pace``

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pages for people: the calibration report, the plan sheet, and where a result comes from.
 
 ``render`` is the one template engine, also for other packages. docs/glossary.md explains the words.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The report of a calibration: is it good, how good, which numbers say so, how to apply it, where it comes from.
 
 ``calibration_report`` gathers a problem, its estimate and what is drawn of them; ``write_report`` makes one HTML

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The charts of a calibration, as drawings: before and after, predicted and achieved, residuals, correlations.
 
 *By joint.* A residual r at a configuration is shown in the axes that belong to joint l there: along its motion

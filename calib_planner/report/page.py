@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The report of a calibration as one HTML page: for a screen, a phone and paper; without network.
 
 Every number of the page is taken from the JSON that the page holds, by its key there, and written as

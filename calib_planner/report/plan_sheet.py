@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The plan sheet as one HTML page that needs nothing else: for A4 paper, and for a phone beside the robot.
 
 The page begins with the visits. Above them stands only what the person can act on; what the plan promises, what

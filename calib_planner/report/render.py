@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The one template engine of all pages, and drawings as data for it.
 
 A page is a template and values. A drawing is a list of shapes, which the macro ``svg`` of ``macros.html`` writes.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A picture of what was understood of a robot: its chain at zero and in the middle of its range.
 
 The chain is drawn from the base through a point on each joint's axis to the tip; every joint has its axis, in the

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the 3-D view of a calibration shows, in the axes of the robot's own base so that the robot stands upright.
 
 Points x in the tracker's frame become Rᵀ (x − t), with R, t the identified pose of the base; vectors Rᵀ v. The

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The robot: a chain of elementary transforms with named parameters, its kinematics,
 and which of its parameters data can identify.
 

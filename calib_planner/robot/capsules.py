@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The robot's body as capsules: segments along the chain, each with a radius.
 
 The segments join what the kinematic model knows: the base's origin, the joints' origins in order, the tip's

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The robot: eq. (1) and (2), a serial chain of elementary transforms with named parameters.
 
 A ``Robot`` never changes. ``with_parameters``, ``with_base``, ``with_targets`` and ``with_deviations`` return

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Joints that a controller shows against other joints.
 
 Arms with a parallelogram have the drive of the forearm at the shoulder: their controllers show the angle of

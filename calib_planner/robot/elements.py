@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Elementary transforms, in which a robot is written, eq. (2), and Denavit–Hartenberg tables as such chains.
 
 Each element is a translation along or a rotation about one coordinate axis of the frame that the elements

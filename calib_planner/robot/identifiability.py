@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which parameters the data can tell apart, and in whose favour ties are broken.
 
 The columns of the stacked, weighted Jacobian are scaled to unit length and taken in order of priority. A

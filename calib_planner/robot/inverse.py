@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Inverse kinematics near a start, for many goals at once: bounded Levenberg–Marquardt.
 
 The residual of configuration q against the goal position g and, unless only the position counts, rotation R_g is

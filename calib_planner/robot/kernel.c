@@ -1,3 +1,5 @@
+/* Copyright 2026 calib_planner contributors */
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The programs of kinematics.py, and the running sums of linearisation.py, without an array call per operation.
  *
  * A program is a list of additions, subtractions and products of vectors over configurations. NumPy runs each over a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Forward kinematics and all its derivatives as one straight-line program of array operations.
 
 Derivation. Let the frame before element e have origin o_e and axes R_e, all in the base frame, and let

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Joint limits and reflectors that cannot be meant as they stand, and what is made of them.
 
 Descriptions of robots state limits in radians and metres. Three kinds of numbers are something else:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the robot is at a batch of configurations, and how points move with parameters and joints.
 
 ``Posture`` holds the frames of the chain, ``Linearisation`` eq. (3) and one order beyond.

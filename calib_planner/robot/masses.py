@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Masses of the links, as the robot's file states them, and whether they can be believed.
 
 Only what a joint carries loads it, so that a mass belongs to a joint: the last one before it in the chain. Many

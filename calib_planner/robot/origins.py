@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot's calibration as the poses of its joints: what URDF and kinematics files can say.
 
 A robot from a URDF has, for every joint, ``P · A · R(q + δ) · A⁻¹``: its origin P with placement errors, the

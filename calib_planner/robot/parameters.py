@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which geometric parameters a robot has, what each is about, and how a request names them.
 
 A request is a level — ``offsets``, ``lengths``, ``lengths+offsets`` (the paper's), ``full`` (six placement

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A campaign over ROS: its problem from the parameters, measuring its configurations, its status and its results.
 
 ``Measuring`` tells the identifier the plan, sends the robot to one configuration at a time and listens to what

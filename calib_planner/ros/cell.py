@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A cell's file (``cell.yaml``) in the nodes.
 
 A node whose parameter ``cell`` names the file takes the pieces of its problems from there that are more than a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m calib_planner.ros.demo``: a KUKA KR-270 is calibrated over ROS 2 from start to end.
 
 Three processes (planner, identifier, simulated tracker) with DDS between them, and this one that asks for a plan,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the identifier publishes on ``/diagnostics``: its streams, its session, its estimate, its store.
 
 A snapshot goes in and findings come out. The level is ERROR where no measurement can be accepted, WARN where

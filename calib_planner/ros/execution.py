@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Executing a plan with a real robot, as a value: events go in, actions come out. No ROS, and nothing waits here.
 
     READYING ──▶ MOVING ──▶ MEASURING ──▶ LEAVING ──▶ READYING … ──▶ ENDED

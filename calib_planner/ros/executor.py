@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Executing plans: which ones a robot can execute, and one ``ExecutePlan`` goal at a time that always ends.
 
 ``check_executable`` serves the simulated robot and the adapter of a real one alike.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the launch files share. They import it from the installed package, since their own folder is on no path.
 
 Every launch file has the arguments of ``COMMON`` beside ``namespace`` and ``params_file``; an argument goes to

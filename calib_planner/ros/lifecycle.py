@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The base of the nodes: a lifecycle node that starts by itself, or says why not, and survives exceptions.
 
 A node implements four hooks: ``configure`` makes everything that the node needs from its parameters, ``activate``

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """RViz markers of a plan: the robot at every configuration, the targets, their order and the path. And of an
 estimate: the measured points, and how far each is from where it should be.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Messages to values of the library and back; nothing here needs a node or spins.
 
 What comes over the wire is checked here and nowhere else: lengths, finiteness, sizes. What does not fit raises

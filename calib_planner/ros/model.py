@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which robot a node works for: a shipped one by name, or the URDF heard on ``robot_description``.
 
 Anyone on the graph may publish a robot description. It is therefore bounded before it is parsed (length, number

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The web server of the page: an event loop in a thread of its own, which the node never waits for.
 
 *What comes in.* ``GET /`` is the page, ``GET /live`` a WebSocket that tells what changes, ``POST /do/NAME`` a

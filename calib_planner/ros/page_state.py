@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the page shows, as a pure value: messages go in, sections of plain values for the browser come out.
 
 ``PageState`` is what was heard. Each ``on_…`` takes a message and returns the state afterwards; what does not fit

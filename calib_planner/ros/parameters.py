@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node parameters, declared once by a frozen dataclass: type, default, description, unit, range, choices.
 
 Each field is a parameter. It is made with ``parameter`` or, in a class of settings of the library, with

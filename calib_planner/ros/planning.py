@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """From a request for a plan to a plan, or to a refusal that names the field: no node, no executor.
 
 The request is the same for service and action. It comes from anyone, so the robot must

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Nodes as processes, on a ROS domain that nobody else uses.
 
 ``Nodes`` ends them when it is left. They also end with the process that started them, even if that is killed:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How far each measured point is from where an estimate puts it: for ``~/residuals`` and ``~/markers``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What was measured of a campaign or a plan, and the estimate from it: the identifier without ROS, its files.
 
 A session belongs to one campaign, whose plans share their measurements, or to one plan that is part of no

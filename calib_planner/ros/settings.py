@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The parameters of the nodes, and the writer of ``config/*.yaml``, which repeats them for users.
 
     python -m calib_planner.ros.settings

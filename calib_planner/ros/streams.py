@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The streams of the drivers that the identifier listens to: joints, points, and what the tracker says of itself.
 
 Points come in the type that the driver publishes: it is looked up among the publishers of the topic, unless the

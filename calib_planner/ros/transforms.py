@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the tracker and the reflectors are, for the tree of transforms: ``/tf_static``.
 
 Each frame of a tree has one parent. ``robot_state_publisher`` gives every link of the robot its parent, and the

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Ways of the robot as messages: to a controller, and from MoveIt.
 
 Both kinds of messages are optional: where ``control_msgs`` or ``moveit_msgs`` is not installed, ``None`` stands

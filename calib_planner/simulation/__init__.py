@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The world we test in: a robot with hidden true parameters, a tracker with noise, and what goes wrong.
 
 docs/glossary.md explains the words.

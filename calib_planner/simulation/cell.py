@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot with hidden true parameters, a tracker with noise, and what goes wrong on a shop floor.
 
 How a sound robot errs is drawn from an error model (``error_model.Truth``), the same that identifications reckon

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How the simulated robot moves through a plan: a function of time, without a clock of its own.
 
 Between rests all joints move together along s(τ) = 10τ³ − 15τ⁴ + 6τ⁵, at rest at both ends with zero

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The messages of robot and tracker in virtual time: what is sent when, what arrives when, and in which order.
 
 Every stream takes its samples at its own rate. A sample becomes a message with a stamp of its sender's clock, and

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot and tracker with faults: where the targets really are, and what the tracker sees of them.
 
 ``World`` is a pure function of where the robot is told to be: whatever happens at an arrival, what the error

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The laser tracker: the covariance of a point that it measures, and what it can see from its station.
 
 docs/glossary.md explains the words.

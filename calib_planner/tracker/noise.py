@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How precise the tracker's coordinates are: the covariance of one measured point.
 
 Isotropic (assumption A3 of the paper): σ² I. A laser tracker measures a range d and two angles from its

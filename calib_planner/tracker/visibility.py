@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a tracker sees from its station: distance, azimuth, elevation, incidence on the reflector, clear beams.
 
 For a station s and a target p, the beam is b = p − s, d = |b|. With u the unit vector of the station's vertical

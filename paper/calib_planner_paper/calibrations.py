@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Many simulated calibrations with one plan: what Figs 2, 3 and 5 show as points.
 
 A point is the error ε = g(q0, Π̂) − g(q0, Π) that one calibration leaves at the test pose, eq. (4). Its components

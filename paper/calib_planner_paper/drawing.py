@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The figures: one look, colours that colour-blind readers can tell apart, SVG and PNG.
 
 Each figure comes wide (panels side by side) and narrow (panels below each other, for phones).

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The KUKA KR 270 of section 6: Table 2, random and proposed plans with their bound, and Fig. 5, calibrations.
 
 The paper gives neither test pose nor link lengths nor workspace, so three test poses and a workspace are chosen

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the paper prints, so that it can be shown beside what is computed. Nothing here enters a computation.
 
 A. Klimchik, A. Pashkevich, Y. Wu, B. Furet, S. Caro: Optimization of measurement configurations for geometrical

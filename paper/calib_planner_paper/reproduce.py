@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner reproduce``: the paper's tables and figures in one run, computed again.
 
 Settings → ``reproduce`` → numbers → ``publish`` → files.

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Section 5: the two-link arm of Table 1 and of Figs 2 and 3.
 
 Its closed form, beside which the library's numbers stand, follows from

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The clocks' offset out of when joints and points stand still, against offsets that were put in."""
 
 from __future__ import annotations

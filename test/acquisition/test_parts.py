@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Joints in parts, a rail and an arm: a standstill that is long enough is accepted, and a motion is not.
 
 As ``test_standstill_rates.py``, whose lever now stands on a rail: the rail and the arm have messages of their

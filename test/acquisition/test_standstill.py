@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The standstill detector against streams whose standstills are known."""
 
 from __future__ import annotations

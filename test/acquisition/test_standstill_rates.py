@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A standstill that is long enough is accepted, and a motion is not, whatever the rates, delays and dwells.
 
 The messages of a lever of 2 m are computed: it rests at stops for times that differ, and moves smoothly between.

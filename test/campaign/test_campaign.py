@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whole campaigns: they reach what is asked, cost what it must, and say so honestly when they cannot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The state machine: what follows from what, without a robot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Campaigns on simulated cells, and what came true of them.
 
 Unless a test says otherwise, robots err in their parameters alone and campaigns know that (the paper's model).

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``run`` identifies; ``points`` are measurements for it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Runs of ``calib-planner identify`` for tests, and measurements for them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bad input: exit status, one line that names what is wrong and what is valid, nothing on stdout."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``campaign`` as a user runs it: in simulation, by hand round by round, and refused."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """--cell: options for every command from one file, which flags override."""
 
 from __future__ import annotations

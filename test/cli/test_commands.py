@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The commands as a user runs them: the contract's JSON keys, files that feed the next command, status."""
 
 from __future__ import annotations

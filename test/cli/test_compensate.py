@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner compensate`` as a user runs it: estimate and targets in, corrected targets out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """--constraints and --instrument: plans obey the files, and what is wrong with them is said in one line."""
 
 from __future__ import annotations

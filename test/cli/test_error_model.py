@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The error model as a user of the commands meets it: keys, tables, files, what is refused."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """--payload, --mounting and --vertical as a user gives them: what is used is said, saved and compensated."""
 
 from __future__ import annotations

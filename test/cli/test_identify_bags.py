@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner identify`` with a bag: the same numbers as from its rows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner identify`` as a user runs it: every option against an independent way to the same numbers."""
 
 from __future__ import annotations

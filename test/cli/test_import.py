@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner import``, and the other commands with tables that are not this package's own."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``calib-planner init``: a cell from options or answers, and what a file of measurements says about it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``program`` as a user runs it: to a file, to stdout, as JSON, and what is refused."""
 
 from __future__ import annotations

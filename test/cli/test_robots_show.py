@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``robots show``: what was understood of a file, what was ignored, and a picture of the chain."""
 
 from __future__ import annotations

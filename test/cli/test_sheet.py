@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``sheet`` and ``plan --sheet`` as a user runs them: files, JSON, what is refused and how."""
 
 from __future__ import annotations

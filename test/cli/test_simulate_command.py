@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """``simulate`` draws a robot from an error model and says what it drew."""
 
 from __future__ import annotations

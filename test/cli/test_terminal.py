@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Progress on a terminal: nothing for quick work, a bar with what is being done for the rest."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Times as people write them, and what plan says of the minutes that it takes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Small linear problems and simulated measurements that the tests of the estimation share."""
 
 from __future__ import annotations

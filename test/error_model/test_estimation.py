@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The estimator: the paper's case, simulated robots with known truth, gross errors, and a measured robot."""
 
 from __future__ import annotations

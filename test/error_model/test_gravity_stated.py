@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Payloads and mountings that are stated: with the right ones, a robot with gravity is predicted to the noise."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """(M2), (M3) and predictions: against the paper's formulas, brute force, and what they must be invariant to."""
 
 from __future__ import annotations

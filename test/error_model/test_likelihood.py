@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Both forms of the linear problem against brute force, and every derivative against differences."""
 
 from __future__ import annotations

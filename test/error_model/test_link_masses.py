@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Masses of the links: what a robot's file says of them, when that is believed, and the moments that follow."""
 
 from __future__ import annotations

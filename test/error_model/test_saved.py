@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The saved form gives the same model back, and refuses what it does not know."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Each term's columns, prior and gradients against an oracle of its own."""
 
 from __future__ import annotations

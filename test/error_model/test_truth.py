@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot drawn from the error model errs as the error model says."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Good messages, and what the nodes make of them, for the fuzz targets; needs ROS 2."""
 
 from __future__ import annotations

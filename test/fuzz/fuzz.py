@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Fuzz one target, or each in turn, guided by coverage: needs the package atheris (``pip install atheris``).
 
     python test/fuzz/fuzz.py [--seconds 600] [TARGET …]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is fuzzed: every reader of files, and every conversion of a message. Each target takes bytes.
 
 A target ends: in a value, or in a ``CalibPlannerError`` of one line. Everything else is a fault. What a file

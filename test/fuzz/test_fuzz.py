@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every input that was kept, and some edits of each, ends in a value or in an error of ours; without atheris."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The command lines of the golden files, as users type them, and the files that they read.
 
 A case runs in an empty folder of its own. There it finds the files that its words name: those of ``TEXTS``,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Makes ``import golden`` and ``import cases`` work for the tests of this folder; says how they compared."""
 
 import sys

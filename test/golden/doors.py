@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What Python programs may import: the names of all doors, with arguments, as docs/api-policy.md says."""
 
 from __future__ import annotations

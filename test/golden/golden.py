@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Runs the command lines of ``cases``, reads what they leave, and says where two answers differ."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the nodes offer to ROS, seen from outside: parameters, topics, services, actions; and the interfaces.
 
 The nodes run as processes, by the entry points of setup.py, on a ROS domain of their own, all at their defaults.

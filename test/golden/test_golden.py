@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What users get from ``calib-planner`` is what ``expected/`` says; see README.md."""
 
 from __future__ import annotations

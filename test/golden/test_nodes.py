@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What doors, nodes and interfaces offer is what ``expected/`` says."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rewrites what the golden tests expect, after an intended change: ``python test/golden/update.py [NAME …]``.
 
 Without names every file, ``nodes`` and ``interfaces`` included. Look at ``git diff test/golden/expected`` before

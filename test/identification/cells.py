@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated cells that the tests of the identification share: placed anywhere, spoilt, with bad transmissions."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """All terms of the error model: what is predicted is what is achieved, and it survives a file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every row of the table of alternatives is named where it is true, and nothing where nothing is wrong."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The iteration reaches the minimum from where robots really are, and says where it cannot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the data cannot see is named exactly, fixed in a stated order, and never hidden behind a number."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Identification accepted by the truth it was given, and by fresh poses; never by its own residuals alone."""
 
 from __future__ import annotations

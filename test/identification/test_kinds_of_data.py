@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Kinds of measurements that have misled an identification: each gives an estimate that says what is the case."""
 
 from __future__ import annotations

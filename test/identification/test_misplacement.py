@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Base and targets that stand elsewhere than the robot says are found out before the fit."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's model is plain least squares, eqs. (6), (7) and (11): against scipy and the covariance formula."""
 
 from __future__ import annotations

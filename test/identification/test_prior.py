@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A prior is so many more equations: against scipy on the stacked problem, and against its own promises."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What an identification must not depend on, and what it must: tracker, order, units, amount of data.
 
 Each property holds for any data; the data are random, with seeds. The paper's model with a stated σ is exact, so

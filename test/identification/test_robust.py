@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Gross errors are listed one by one, and what is left is the fit that knew them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What was predicted for held-out points is what happens there, over many cells; the bookkeeping is exact."""
 
 from __future__ import annotations

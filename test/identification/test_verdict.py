@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every reason of the verdict can be provoked by data, has its level and advice, and is absent otherwise."""
 
 from __future__ import annotations

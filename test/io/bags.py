@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bags for tests: a simulated robot that moves and rests before a tracker, written with rosbags' own writer."""
 
 from __future__ import annotations

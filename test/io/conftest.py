@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A campaign store and a plan for it."""
 
 from collections.abc import Iterator

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Measurements laid out as people have them: one table of layouts, and the writer that makes a file of each."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Stores for tests, and records whose numbers only exact writing brings back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bags: what is read is what the live node would have measured, however the bag is named and written."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bags that are flawed, damaged or none at all: every flaw is named, what can be kept is kept."""
 
 from __future__ import annotations

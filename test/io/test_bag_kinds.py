@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bags as drivers write them: poses and transforms, joints in parts, millimetres and degrees."""
 
 from __future__ import annotations

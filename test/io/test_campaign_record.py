@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The record of a campaign: what was noted comes back to the bit, what is torn or foreign does no harm."""
 
 from __future__ import annotations

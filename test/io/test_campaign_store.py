@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The campaign store: exact, durable against kill -9 and full disks, and never another's file."""
 
 from __future__ import annotations

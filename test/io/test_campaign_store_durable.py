@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The campaign store on full and read-only disks and under kill -9: nothing told to be kept is lost."""
 
 from __future__ import annotations

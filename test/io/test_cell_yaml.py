@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """cell.yaml: what is read, what is refused, and the pieces of problems that come of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Constraints and instruments as YAML: what is shipped, what each key gives, every bad key named."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """CSV files: what is written is read back to the bit, and every flaw is named by line and column."""
 
 from __future__ import annotations

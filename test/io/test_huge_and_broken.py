@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """CSV files as people and programs really leave them: too large, in the wrong dress, cut off, or no text at all.
 
 Whatever the bytes: numbers come back as they were written, or one error in one line says where and why.

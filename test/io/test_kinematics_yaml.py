@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Kinematics YAML: the convention of Universal Robots, the hash, and the way back to a robot."""
 
 from __future__ import annotations

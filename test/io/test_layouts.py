@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Measurements in whatever layout they come: the same numbers, and one line that says what the file is like."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plan sheets as CSV and YAML come back to the bit, and the CSV is read as a plan by whatever reads one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Points in files of their own: matched by name, by time or by order, and it is said which."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Prior knowledge as YAML: units, the three ways to say it, estimates from before, and every flaw by its key."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Robot programs: a parser for each maker's text reads every value, visit, repetition and signal back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Writing: the whole file or the old one, the permissions kept, and the option named when it fails."""
 
 from __future__ import annotations

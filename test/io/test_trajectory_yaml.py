@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The trajectory: the message's fields in their order, exact positions, the timetable's times, no way out."""
 
 from __future__ import annotations

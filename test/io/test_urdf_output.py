@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Calibrated URDFs: what changed, what did not, and the kinematics after loading them again."""
 
 from __future__ import annotations

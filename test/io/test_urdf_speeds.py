@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Speed limits of a URDF: by joint name, none rather than half of them, flaws named."""
 
 from __future__ import annotations

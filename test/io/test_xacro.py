@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Robots written in xacro: what is expanded, where packages are looked for, and what is said without xacro."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plans and estimates as YAML: exact round trips, and every flaw is named by its key."""
 
 from __future__ import annotations

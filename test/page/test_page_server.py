@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The page's web server, without ROS and browser: who may come, who is told what, and clients that misbehave."""
 
 from __future__ import annotations

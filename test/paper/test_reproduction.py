@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's tables and figures: against closed forms, an oracle of its own, and Monte-Carlo error bounds."""
 
 from __future__ import annotations

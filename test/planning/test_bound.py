@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The bound: no plan beats it, the proof is above everything that can be sampled, and it meets eq. (20)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """How many measurements, how they are split, and random plans as the baseline."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Choosing from a pool: against brute force, with and without repeats, and what cannot be chosen."""
 
 from __future__ import annotations

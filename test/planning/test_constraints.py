@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Each constraint against hand calculation or a plain loop; conflicts are named; plans keep to all of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Criteria and information: slopes and gradients against independent oracles, concavity, units, bounds."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Information under a whole error model: gradient, elimination, bound, and the plans that follow from it."""
 
 from __future__ import annotations

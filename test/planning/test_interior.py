@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Descents inside the allowed set: known minima on edges, normals by hand, plans as good as a long search's."""
 
 from __future__ import annotations

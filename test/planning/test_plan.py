@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The planner on the KR-270: gradient, bound, honesty of what it reports, refusals."""
 
 from __future__ import annotations

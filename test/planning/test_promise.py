@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The accuracy that a plan promises is the one that the robot shows, whatever is unknown."""
 
 from __future__ import annotations

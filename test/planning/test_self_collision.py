@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Self-collision by Pinocchio and Coal, on an arm of boxes, balls and cylinders whose collisions are known."""
 
 from __future__ import annotations

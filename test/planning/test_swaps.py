@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Swaps with random configurations: what each would give is what the plan with it is worth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Timetables: no joint exceeds its speed, every stop has its standstill, and what is not known is not stated."""
 
 from __future__ import annotations

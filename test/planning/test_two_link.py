@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Section 5 of the paper: closed forms (17)–(20), Table 1, Figs 2 and 3."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Checks of stops against oracles of their own; sheets keep plan and order, and claim nothing unchecked."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A headless Chromium for tests, driven over the DevTools protocol through a pipe: no driver, port or network.
 
 ``Browser.open`` loads a page in a window of any size; the ``Tab`` runs scripts in it, moves a real mouse and

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Calibrations that the tests of the report share: clean, with gross errors, too few points, several targets."""
 
 from __future__ import annotations

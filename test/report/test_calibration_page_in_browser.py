@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The report in a real browser: no errors, the 3-D view draws and turns, tables sort; screen, phone and paper."""
 
 from __future__ import annotations

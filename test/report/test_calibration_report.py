@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The report of a calibration: its numbers are the estimate's, its drawings true, nothing is from elsewhere."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The demo's report: numbers, keys, table and picture."""
 
 from __future__ import annotations

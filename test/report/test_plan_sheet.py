@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The page: all numbers of the sheet, nothing from elsewhere, nothing claimed, drawings true to scale."""
 
 from __future__ import annotations

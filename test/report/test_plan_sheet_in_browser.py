@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The plan sheet in a browser: it remembers ticks and notes, gives them back as CSV, and fits its paper."""
 
 from __future__ import annotations

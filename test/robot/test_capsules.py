@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of joints and tip: by hand for two links, against Pinocchio, and in agreement with positions."""
 
 from __future__ import annotations

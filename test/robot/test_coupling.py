@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Joints that a controller shows against others: motions, derivatives, moments, limits, and every command."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every derivative of the chain against an oracle that shares no code with it.
 
 Complex step: Im f(x + ih)/h is exact to rounding for the analytic functions here. Central differences: the

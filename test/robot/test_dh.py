@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Denavit–Hartenberg tables against the textbooks' 4×4 matrices, published tables and the chain's other forms."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The compiled kernel does what NumPy does: NumPy is the oracle, and complex numbers stay with it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """One robot written in four ways: every level, and lists of names, identified from simulated data.
 
 Accepted by poses that took no part: what a level frees, the data must give back, whatever the file's kind.

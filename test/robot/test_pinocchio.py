@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Positions, joint Jacobian and the Jacobian of placement errors against Pinocchio."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The robot as a value: catalogue, parameters, immutability, what it refuses."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which chain is read from a URDF, with what numbers, and what is said when there is none."""
 
 from __future__ import annotations

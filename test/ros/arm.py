@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """An arm and its controller in virtual time: follows a trajectory well or badly, answers soon, late or never.
 
 The tests of the pure execution step through it; the stand-in of the nodes' tests moves by the same model.

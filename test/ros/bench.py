@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A context of its own with the node under test and a client node, spun in a thread.
 
 Nothing sleeps and hopes: ``wait`` waits for a condition up to a deadline, and calls are repeated because an

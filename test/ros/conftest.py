@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tests of the nodes: left out without ROS, on a ROS domain of their own, a fresh context per test."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The person at a campaign: calls its services, hears its status."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot and an identifier in one, without standstills: what the campaign node talks to, as bad as a test wants.
 
 It takes plans, executes goals at once, and publishes what it "measured" of a robot with true errors.

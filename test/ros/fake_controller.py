@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot, its controller and its tracker as a node, on a clock of their own that runs faster than the real one.
 
 The node publishes ``/clock``: everybody who uses simulated time lives in its time. It offers the real action

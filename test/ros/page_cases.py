@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A campaign as messages, without nodes: a KUKA KR-270 before a tracker, for tests and pictures of the page."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Reads an SROS2 policy file, and refuses one that is not of the form that ``ros2 security`` takes (0.2.0)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Sessions of the identifier without ROS: a robot that errs, its plans, and what the tracker sees of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot and a tracker that are not there: standstills for an identifier in this process, over real topics."""
 
 from __future__ import annotations

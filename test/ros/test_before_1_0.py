@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Messages from before 1.0, as an old bag plays them: a node says what they are, takes none of them, and goes on.
 
 The files in ``before_1_0`` are what the messages of that time were on the wire.

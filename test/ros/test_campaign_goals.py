@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a campaign has to reach is in its record: the parameters with it, and what differs, in words."""
 
 from __future__ import annotations

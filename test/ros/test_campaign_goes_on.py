@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The campaign below the node: outliers with a trail, restarts, kill -9, disks in trouble."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A validation that contradicts joins the fit: the identifier hears of it, before and after a restart."""
 
 from __future__ import annotations

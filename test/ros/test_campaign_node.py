@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The campaign node: with the real three nodes, and with a robot and an identifier that do all that is bad."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The campaign node as a process that is told to end: the robot stops, a restart goes on with the campaign."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The campaign node and rejections that no other configuration would escape: clocks, frames, disks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A person at a campaign: looks at the first plan, leaves out, replaces, remedies, and starts the node anew."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The driver of docs/connecting.md as it stands there, and the parameters that the page names."""
 
 from __future__ import annotations

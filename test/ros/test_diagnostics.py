@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the identifier says on /diagnostics, from snapshots with known content."""
 
 from __future__ import annotations

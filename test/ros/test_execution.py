@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Executions as values: what a good robot, a bad one, a deaf one and a person with a stop button make of them."""
 
 from __future__ import annotations

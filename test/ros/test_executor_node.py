@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The executor over its real action and a controller's real action, in accelerated time."""
 
 from __future__ import annotations

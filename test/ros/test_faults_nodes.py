@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Some of bench/faults_nodes.py: campaigns with faults through the nodes, on a clock that waits for them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every node says on /diagnostics how it is, in every state, and what to do where something is missing."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Anyone on the graph may send anything to the campaign node, too; a robot may answer anything.
 
 A campaign is under way, its robot at a configuration. After every attack the node answers, the campaign stands

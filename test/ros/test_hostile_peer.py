@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Anyone on the graph may send anything: the nodes refuse it with a reason, go on, and write nowhere else.
 
 Planner, identifier and simulator run in this process and hear each other, as in a cell. After every attack each

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identifier node between campaigns and recordings: what it publishes and saves belongs to one campaign."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identifier of a robot that is described: on ``robot_description``, by URDF."""
 
 from __future__ import annotations

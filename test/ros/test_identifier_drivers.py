@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identifier and what real drivers publish: joints in parts, poses, transforms, restamped points, a state."""
 
 from __future__ import annotations

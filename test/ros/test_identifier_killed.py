@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identifier as a process, killed with -9 while it is fed: the campaign goes on, the estimate is the same."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identifier node fed over real topics by a robot that is not there, in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The identifier and streams that do not fit together: clocks that differ, points in another frame."""
 
 from __future__ import annotations

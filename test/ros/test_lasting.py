@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Services and action servers are destroyed while other threads wait for them, take from them, answer by them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Launch files: they name what exists, explain every argument and start our nodes only.
 
 launch is not among the PyPI wheels: ``Recorded`` stands in for everything of it, and keeps what it was made with.

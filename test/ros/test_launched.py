@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A campaign in two cells at once by the launch file, from start to verdict, with nodes as processes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The base of the nodes, by a small node of its own: transitions, reasons, overrides, hostile callers."""
 
 from __future__ import annotations

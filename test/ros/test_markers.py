@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What RViz gets, and what a controller gets: against the robot's own kinematics, bounded, never too fast."""
 
 from __future__ import annotations

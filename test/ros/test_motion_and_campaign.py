@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The pure parts below the nodes: how the robot moves, what a campaign makes of standstills."""
 
 from __future__ import annotations

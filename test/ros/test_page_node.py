@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The page's node: what others publish is shown, what is pressed is called; a real browser looks and clicks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the page shows, from messages alone: no node, no server, no browser."""
 
 from __future__ import annotations

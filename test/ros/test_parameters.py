@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node parameters: declared once, the YAML files say the same, what is out of range is refused."""
 
 from __future__ import annotations

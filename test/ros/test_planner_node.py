@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The planner node over real topics, services and actions, in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Requests to answers, without a node: every bad one names its field."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Streams fetched by a timer: nothing is missed, the stamps decide the order, one bad message harms no other."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Nodes as processes: they end when told to, with status 0, and with the process that started them."""
 
 from __future__ import annotations

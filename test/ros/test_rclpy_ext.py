@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What rclpy does by itself, as ``ros/rclpy_ext`` says: where a test fails, its work-around may go."""
 
 from __future__ import annotations

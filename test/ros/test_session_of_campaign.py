@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is saved is what was meant: one campaign, without its validation, each standstill once."""
 
 from __future__ import annotations

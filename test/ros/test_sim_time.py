@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Waits of the nodes follow simulated time where ``use_sim_time`` is set, and nothing else."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The simulated robot and tracker over real topics and its action, in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The simulator as the controller and the tracker of a cell: real actions and topics, in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The SROS2 policy allows each node exactly what it does on the graph, by relative names."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The real thing: planner, identifier and simulator as processes, DDS between them, truth hidden in one."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The trajectory's YAML is a JointTrajectory: set field by field and read back, it is the same.
 
 ``rosidl_runtime_py`` is what ``ros2 topic pub`` uses. Where that is not installed, its rules are applied here:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tracker and targets on ``/tf_static``: chained through the robot, the transforms give the measured points."""
 
 from __future__ import annotations

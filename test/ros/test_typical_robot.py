@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot that errs in every way, through the nodes: its plan by service and by action, and a whole campaign."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A tracker that loses its targets where the robot arrives or departs, and gets them back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Some of bench/fault_matrix.py: campaigns with faults end with the truth or with an honest verdict."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every fault does what its description says, and nothing else: messages with it beside messages without."""
 
 from __future__ import annotations

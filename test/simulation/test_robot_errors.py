@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The simulated robot errs as its error model says: in its cell, at each arrival, and with faults on top."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Geometry of the beam: by hand, against brute force over the segments, and properties."""
 
 from __future__ import annotations

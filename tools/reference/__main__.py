@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/reference/ from the code: interfaces, node parameters, command line, codes.
 
     python tools/reference [FOLDER]

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """docs/reference/cell.md: the keys of ``cell.yaml``, from the table that reads them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """docs/reference/codes.md: every status, reason and error that a program may meet, with what to do.
 
 All of it is read from the tables that the library itself uses: statuses are dictionaries, and the reasons of a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """docs/reference/command-line.md: what every command's --help says, as lists that fit a phone."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """docs/reference/interfaces.md: what the nodes offer and take, and every message, service and action. Needs ROS.
 
 The nodes are made and activated, and asked for their publishers, subscriptions, services and actions; the

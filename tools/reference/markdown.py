@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Text as Markdown that GitHub and MyST read alike."""
 
 from __future__ import annotations

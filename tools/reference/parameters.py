@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """docs/reference/parameters.md: the parameters of the nodes, from their dataclasses. Needs ROS."""
 
 from __future__ import annotations

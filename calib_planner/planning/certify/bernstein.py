@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Trigonometric polynomials on a box in Bernstein form: a hull that bounds them, and its halves.
 
 A polynomial here is a tensor with one axis per joint. Along a joint that turns it is trigonometric of degree 2,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The global maximum of a polynomial on a box, certainly: branch and bound on its Bernstein form.
 
 On a box the polynomial lies below its largest Bernstein coefficient, and the coefficients at the corners are

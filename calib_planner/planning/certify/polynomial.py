@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The sensitivity d(q) = tr(G I_1(q)) as what it is: a polynomial in the joints, known from few values.
 
 With isotropic noise and G = S Sᵀ, d(q) = ‖J(q) S‖²_F / (σ² + σ_c²).

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A proof of the bound: a rigorous upper bound on the largest sensitivity, by branch and bound.
 
 By (B) of ``criteria`` a bound on every plan of m visits follows from any gradient G = S Sᵀ once an upper

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Conditions on configurations: the robot's room, the tracker's view, the user's own.
 
 Every number is in the frame of ``Robot.positions``: the robot's base frame, or the tracker's once the robot's

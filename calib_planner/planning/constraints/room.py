@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the robot may be: a box, a floor, narrower joint limits, and whatever the user's function says.
 
 Conditions on the robot's posture share one pass of kinematics, however many they are (``PostureConstraint``).

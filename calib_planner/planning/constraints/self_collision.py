@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """No link runs into another: with Pinocchio and Coal, from the collision geometry of a URDF.
 
 Pairs that always touch say nothing: geometries of one body (links joined by fixed joints are one) and of bodies

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the tracker can see: range, elevation, the reflector's cone, a clear beam. See ``tracker.visibility``."""
 
 from __future__ import annotations

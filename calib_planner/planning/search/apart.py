@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Visits of one plan keep apart: no two of them where one would repeat the errors of the other.
 
 A robot comes back to a configuration with nearly the same error: the joints' functions and gravity are those of

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Local improvement of many plans at once: by gradients in a box, and by random steps where there are
 constraints.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The best of all choices among few candidates: every one of them is evaluated, batch by batch.
 
 Exchange ends where no single exchange helps, and of a handful of candidates that is often not the best choice:

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The best plan from a finite number of candidates: greedy start, then exchange (Fedorov 1972), batched.
 
 Row blocks R_j = W^½ J_j (k, p) of the candidates give the information I_j = R_jᵀ R_j. With M the information of

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Local improvement of many plans at once inside the allowed set, along its edges where it ends there.
 
 A row of X is a plan: the coordinates of ``size`` configurations, one after the other. Constraints say of every

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The best plan over continuous configurations: many descents of −log Ψ from seeded starts.
 
 Gradient. For a plan with M = M_0 + Σ I(q_i), the gradient G = ∂Ψ/∂M turns into ∂Ψ/∂q_i by

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plans from the approximate design, and plans for criteria that are not smooth.
 
 *Rounding.* The configurations of the approximate design are candidates, each of which may be repeated: exchange

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A good plan among many random configurations, for a robot that errs as a whole error model says.
 
 Each configuration of a plan in turn is taken out and the best of a few hundred candidates is put in its place,

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """The nodes, one file each.
 
 Until a node listens to signals (``rclpy_ext.run``), SIGINT ends its process at once and without a word, as

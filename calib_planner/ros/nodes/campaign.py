@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node ``calibration_campaign``: has the robot measured until the estimate is accurate enough.
 
 The library's ``campaign`` says what is to be done next (a pure state machine); plans are made by the library in a

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node ``plan_executor``: executes plans with a real robot's ``FollowJointTrajectory`` controller.
 
 What happens when is in ``execution``, as a value; this file carries its messages. Everything that feeds that

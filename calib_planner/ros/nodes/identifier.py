@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node ``calibration_identifier``: listens to joints and tracker points, publishes the calibrated parameters.
 
 Standstills are detected by ``acquisition.Intake``; ``session`` matches, stores, identifies and saves. This file

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node ``calibration_page``: a web page to watch and steer a campaign, for any browser, also a phone's.
 
 What the other nodes publish becomes a ``PageState`` (``ros/page_state.py``), which the web server shows

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node ``calibration_planner``: makes plans on request (service and action) and publishes the newest plan.
 
 How a request is answered is in ``planning``, for which robot in ``model``; this file carries the messages. A plan

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Node ``tracker_simulator``: a robot with hidden true errors, and a tracker that watches it.
 
 It publishes joint states (what the controller believes) and tracker points (where the true robot is seen), and

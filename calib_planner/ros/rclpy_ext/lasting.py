@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Services and action servers that one thread may destroy while other threads use them.
 
 *What rclpy does.* A transition (``cleanup``) runs in one thread of the executor while another thread collects

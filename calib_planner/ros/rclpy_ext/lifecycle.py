@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """A lifecycle node that leaves nothing behind, refuses impossible transitions and says what it was given.
 
 *What rclpy does, and why that does not serve.*

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Streams of thousands of messages per second: fetched a hundred times per second, in the order of their stamps.
 
 *What rclpy does.* Its executor is woken by every message, builds a new wait set, makes a task and takes one

@@ -1,3 +1,5 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
 """Runs one node in a process of its own, which ends on Ctrl-C or SIGTERM with status 0, on a bad set-up with 1.
 
 *What rclpy does.* Its signal handlers shut the context down at once, so that nobody who waits for an answer gets
