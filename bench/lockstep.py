@@ -30,6 +30,7 @@ from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.event_handler import EventHandler
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
+from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -144,7 +145,8 @@ class Stage:
     def __init__(self) -> None:
         self._kept = ExitStack()
         self.context, domain = Context(), self._kept.enter_context(own_domain())
-        quiet = ["--ros-args", "--log-level", "fatal"]
+        quiet = ["--ros-args", "--log-level", "fatal"]  # of the process: what was before comes back at the end
+        self._kept.callback(set_logger_level, "", get_logger_level(""))
         rclpy.init(args=quiet, context=self.context, domain_id=domain)
         self._executor = SingleThreadedExecutor(context=self.context)
         self.now, self.timers, self.nodes = BEGIN, list[Timer](), dict[type, Any]()

@@ -138,9 +138,9 @@ STATES: dict[str, tuple[list[str], list[float], int]] = {
     "empty names": (["", ""], [1.0, 2.0], 0),
     "twice": (["q1", "q1", "q2"], [1.0] * 3, 0),
     "a long name": (["x" * BIG], [1.0], 0),
-    "before time": (NAMES, POSE, -(2**31)),
-    "far future": (NAMES, POSE, 2**31 - 1),
-    "long ago": (NAMES, POSE, 1),
+    "before time": (NAMES, [0.3, 0.5], -(2**31)),
+    "far future": (NAMES, [0.3, 0.5], 2**31 - 1),
+    "long ago": (NAMES, [0.3, 0.5], 1),
 }
 
 
