@@ -191,7 +191,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
 
     def outcome(self, part: str, level: bytes, text: str) -> None:
         """Keep what the newest piece of work came to, for ``/diagnostics``."""
-        seconds = f"{self.now / 1e9:.1f}"
+        seconds = f"{self.now / NANO:.1f}"
         self.newest = (Finding(part, level, text, {"ended at [s]": seconds}),)
 
     @property
