@@ -126,7 +126,8 @@ class CampaignState:
         measurements: In the order of coming.
         failures: ``(index, reason)`` of every attempt that gave no measurement.
         exclusions: Configurations given up that were never measured.
-        dropped: Numbers of configurations that were measured and could not be measured again.
+        dropped: Numbers of configurations that were measured and are not measured again.
+        spared: Those of them that a person wanted to skip.
         rounds: What was decided after each batch.
         phase: One of ``PHASES``.
         outcome: Why no more is measured for the fit, a key of ``OUTCOMES``; empty before.
@@ -143,6 +144,7 @@ class CampaignState:
     failures: tuple[tuple[int, str], ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     dropped: tuple[int, ...] = ()
+    spared: tuple[int, ...] = ()
     rounds: tuple[Round, ...] = ()
     phase: str = FIT
     outcome: str = ""
@@ -193,7 +195,7 @@ class CampaignState:
     @property
     def given_up(self) -> int:
         """Configurations that could not be measured, without those that a person wanted to skip."""
-        return sum(not e.requested for e in self.exclusions) + len(self.dropped)
+        return sum(not e.requested for e in self.exclusions) + len(set(self.dropped) - set(self.spared))
 
     @property
     def measured_q(self) -> FloatArray:
@@ -331,7 +333,8 @@ class CampaignState:
     def _exclude(self, index: int, reason: str, *, requested: bool) -> CampaignState:
         state = replace(self, queue=tuple(i for i in self.queue if i != index))
         if any(r.index == index for r in self.measurements):
-            return replace(state, dropped=(*self.dropped, index))
+            spared = (*self.spared, index) if requested else self.spared
+            return replace(state, dropped=(*self.dropped, index), spared=spared)
         q, scale = self.configurations[index].q, self.scale
         radius = radius_of(q, self.exclusions, self.measured_q, scale, self.problem.exclusion)
         state = replace(state, exclusions=(*self.exclusions, Exclusion(index, q, radius, reason, requested)))

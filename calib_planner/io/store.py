@@ -29,7 +29,7 @@ measured is planned anew.
     {"joined": true}                                  the validation so far is part of the fit from here on
     {"failed": […], "role": "fit", "reason": "…"}     an attempt at a configuration that gave no measurement
     {"excluded": […], "radius": 0.05, "reason": "…", …}
-    {"dropped": 7}                                    where this was measured, no more can be measured
+    {"dropped": 7, …}                                 where this was measured, no more is measured
     {"round": {"number": 0, "measured": 0, …}}        what was known after a batch
     {"finished": "reached"}
 
@@ -806,7 +806,8 @@ class StoredCampaign:
         exclusions: Configurations given up.
         finished: The outcome; empty while it is not ended.
         failures: ``(role, configuration, reason)`` of each attempt that gave no measurement.
-        dropped: Numbers of measurements at whose configurations no more can be measured.
+        dropped: Numbers of measurements at whose configurations no more is measured.
+        spared: Those of them whose configurations a person wanted to skip.
         rounds: What was known after each batch.
     """
 
@@ -817,6 +818,7 @@ class StoredCampaign:
     finished: str = ""
     failures: tuple[tuple[str, FloatArray, str], ...] = ()
     dropped: tuple[int, ...] = ()
+    spared: tuple[int, ...] = ()
     rounds: tuple[Round, ...] = ()
 
     def state(self, problem: CampaignProblem) -> CampaignState:
@@ -839,6 +841,7 @@ class StoredCampaign:
             measurements=measurements,
             failures=tuple((first + k, reason) for k, (_, _, reason) in enumerate(self.failures)),
             dropped=tuple(dict.fromkeys(m.index for m in measurements if m.number in self.dropped)),
+            spared=tuple(dict.fromkeys(m.index for m in measurements if m.number in self.spared)),
             rounds=self.rounds,
         )
 
@@ -873,7 +876,8 @@ class CampaignStore(Store):
             event = {"excluded": e.q.tolist(), "radius": e.radius, "reason": e.reason[:LONGEST]}
             events.append(event | {"asked": e.requested})
         for index in after.dropped[len(before.dropped) :]:
-            events += [{"dropped": r.number} for r in after.measurements if r.index == index][:1]
+            event = {"dropped": next(r.number for r in after.measurements if r.index == index)}
+            events.append(event | {"asked": index in after.spared})
         events += [{"round": plain(asdict(r))} for r in after.rounds[len(before.rounds) :]]
         if after.result is not None and before.result is None:
             events.append({"finished": after.outcome})
@@ -924,7 +928,7 @@ class CampaignStore(Store):
                     points, std = plain(stood.points), plain(stood.std)
                     rows.append((row["told"], row["role"], stood.joints.tolist(), points, std))
             _measurements(self.model.joint_names, rows)  # refuses what is no measurement
-            exclusions, failures, dropped, rounds, finished = [], [], [], [], ""
+            exclusions, failures, dropped, spared, rounds, finished = [], [], [], [], [], ""
             for event in (json.loads(row["document"]) for row in self._rows(sql, current["number"])):
                 if "excluded" in event:
                     q = np.array(event["excluded"], float).reshape(joints)
@@ -937,11 +941,12 @@ class CampaignStore(Store):
                     failures = [(FIT, q, reason) for _, q, reason in failures]
                 elif "dropped" in event:
                     dropped.append(int(event["dropped"]))
+                    spared += dropped[-1:] if event.get("asked", False) else []  # not said by earlier versions
                 elif "round" in event:
                     rounds.append(_round(event["round"]))
                 elif "finished" in event:
                     finished = str(event["finished"])
-        lists = tuple(failures), tuple(dropped), tuple(rounds)
+        lists = tuple(failures), tuple(dropped), tuple(spared), tuple(rounds)
         return StoredCampaign(self, current["plan_id"], tuple(rows), tuple(exclusions), finished, *lists)
 
     def _goals(self) -> dict[str, Any]:

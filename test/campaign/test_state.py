@@ -87,6 +87,13 @@ def test_a_stop_measured_once_and_then_unreachable_leaves_no_neighbourhood(plann
     assert not state.exclusions and state.dropped == (twice,) and twice not in state.queue
 
 
+def test_skipping_what_was_measured_once_is_no_failure_either(planned):
+    twice = next(i for i, s in enumerate(planned.configurations) if s.times == 2)
+    state = planned.measured(twice, planned.configurations[twice].q, POINTS).skipped(twice)
+    assert state.dropped == (twice,) and twice not in state.queue and state.given_up == 0
+    assert state.unreachable(twice, "blocked").given_up == 0, "it is skipped already"
+
+
 def test_what_is_ahead_can_be_planned_anew_around_a_configuration(planned):
     """The visit under way stays; a campaign that is paused has none under way."""
     paused = planned.pause()

@@ -165,6 +165,7 @@ def test_what_failed_was_dropped_and_was_known_comes_back(tmp_path: Path) -> Non
         lambda s: s.failed(5, "a beam break"),
         lambda s: s.failed(1, "moved"),
         lambda s: s.unreachable(3, "a cable"),
+        lambda s: s.skipped(4),
         lambda s: s.decided(NextStep(VALIDATION, "", round=last)),
     ]
     for event in events:
@@ -177,7 +178,7 @@ def test_what_failed_was_dropped_and_was_known_comes_back(tmp_path: Path) -> Non
     assert state.spent(FIT) == 4 and state.spent(VALIDATION) == 2 and state.given_up == 3
     for role in (FIT, VALIDATION, None):
         assert again.spent(role) == state.spent(role), role
-    assert again.given_up == state.given_up and len(again.dropped) == 1
+    assert again.given_up == state.given_up and len(again.dropped) == 2 and len(again.spared) == 1
     assert again.configurations[again.dropped[0]].q.tolist() == Q[3].tolist()
     assert [reason for _, reason in again.failures] == ["undone", "a beam break", "moved"]
     assert again.rounds[1] == last and repr(again.rounds[0]) == repr(first)
