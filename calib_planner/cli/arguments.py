@@ -55,7 +55,7 @@ def add_command(
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
-        description=description or summary,
+        description=description or f"{summary[:1].upper()}{summary[1:]}.",
         epilog=f"Example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -125,7 +125,7 @@ def add_robot(parser: argparse.ArgumentParser, otherwise: str = "", *, targets: 
 def add_links(group: Group) -> None:
     """The two ends of the chain in a URDF."""
     option(group, "--base-link", "LINK", "first link of the chain in a URDF (its root)")
-    option(group, "--tip-link", "LINK", "last link of the chain in a URDF (its only leaf)")
+    option(group, "--tip-link", "LINK", "last link of the chain in a URDF (its only end, or tool0)")
 
 
 def add_couple(group: Group) -> None:
@@ -145,7 +145,8 @@ def coupling(text: str) -> Coupling:
 def add_parameters(parser: argparse.ArgumentParser, unknown: str = "none") -> None:
     """--parameters and --unknown; ``unknown``: what the help says of the latter's default."""
     group = parser.add_argument_group("what is unknown")
-    text = "lengths+offsets, lengths, offsets, full, or NAME,NAME,… (the robot's own; see robots show)"
+    text = "lengths+offsets, lengths, offsets, full, another level of the robot's file, or NAME,NAME,… "
+    text += "(the robot's own; see robots show)"
     option(group, "--parameters", "P", text)
     text = "base (pose of the robot in the tracker's frame), tool (offsets of the reflectors) or base,tool "
     text += f"({unknown})"

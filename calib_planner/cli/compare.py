@@ -55,7 +55,7 @@ def _size(word: str) -> tuple[int, int]:
 
 def show_comparison(columns: list[Comparison], console: Console) -> None:
     """Print Table 2."""
-    table = Table(title="ρ0 at the test pose [µm], by number of experiments")
+    table = Table(title="ρ0 at the test pose [µm], by number of configurations")
     table.add_column("")
     for column in columns:
         table.add_column(column.label.replace("x", "×"), justify="right")

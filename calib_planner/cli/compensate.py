@@ -63,7 +63,7 @@ def add(commands: Commands, summary: str) -> None:
     add_reading(parser)
     what = parser.add_argument_group("what to correct")
     option(what, "--estimate", "FILE", "estimate, written by identify --output", required=True)
-    text = "CSV of joint targets [rad | m]"
+    text = "table of joint targets [rad | m]"
     option(what, "--targets", "FILE", text, required=True, dest="joint_targets")
     add_correction(what)
     add_seed(parser)

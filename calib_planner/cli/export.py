@@ -61,7 +61,7 @@ def add(commands: Commands, summary: str) -> None:
     text = "xyz and rpy per joint as YAML, as the driver of Universal Robots reads it"
     option(what, "--kinematics", "FILE", text)
     option(what, "--report", "FILE", f"one HTML page; a folder gets {PAGE}")
-    text = "CSV of joint targets [rad | m], and where to write them corrected, in the same units"
+    text = "table of joint targets [rad | m], and where to write them corrected, in the same units"
     option(what, "--targets", "FILE", text, nargs=2, dest="joint_targets")
     add_correction(parser.add_argument_group("how targets are corrected (see compensate)"))
     add_seed(parser)

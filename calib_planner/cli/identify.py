@@ -71,7 +71,7 @@ from calib_planner.robot import Robot, grouped, not_in_origins
 from calib_planner.tracker import LaserTracker, Noise
 from calib_planner.units import length
 
-EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \
+EXAMPLE = """calib-planner identify --robot irb120.urdf --data calibration.csv --parameters full \\
       --unknown base,tool --validate test.csv --validate-target-from 1 --output estimate.yaml"""
 
 DESCRIPTION = """Identify the robot's parameters from measured points.

@@ -33,7 +33,7 @@ COMMANDS = {
     "sheet": ("calib_planner.cli.sheet", "a plan for the person at the robot"),
     "program": ("calib_planner.cli.program", "a plan for the robot's controller"),
     "campaign": ("calib_planner.cli.campaign", "plan, measure and identify until it is accurate enough"),
-    "compare": ("calib_planner.cli.compare", "the proposed plan beside random plans (Table 2)"),
+    "compare": ("calib_planner.cli.compare", "the proposed plan beside random plans of the same size"),
     "import": ("calib_planner.cli.import_data", "measurements of any layout as this package's CSV"),
     "identify": ("calib_planner.cli.identify", "identify parameters from measurements"),
     "compensate": (

@@ -85,10 +85,16 @@ EXAMPLE = """calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 
       --configurations 4 --repetitions 3 --output plan.yaml
   calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --accuracy 0.02e-3
   calib-planner plan --robot kuka_kr270 --degrees --test-pose "0 -60 90 0 45 0" --time-budget 30min --speed 0.2"""
+DESCRIPTION = """Choose the configurations to be measured.
+
+Say where accuracy matters (--test-pose, --test-path) and how much may be measured (--configurations,
+--measurements, --time-budget, or --accuracy for as little as it takes). The answer is the configurations in
+the order of measuring, the accuracy that they will leave, and a bound: what no plan of as many measurements
+can beat."""
 
 
 def add(commands: Commands, summary: str) -> None:
-    parser = add_command(commands, "plan", summary, run, EXAMPLE)
+    parser = add_command(commands, "plan", summary, run, EXAMPLE, DESCRIPTION)
     work = add_problem(parser, any_criterion=True)
     size = work.add_mutually_exclusive_group(required=True)
     option(size, "--configurations", "M", "number of different configurations", kind=int)
@@ -252,7 +258,7 @@ def add_problem(parser: argparse.ArgumentParser, *, any_criterion: bool) -> argp
     text = "YAML: parameter name to standard deviation [m | rad], or a prior as for identify; "
     text += f"{TYPICAL}: the data sheet within usual manufacturing errors (none)"
     option(known, "--prior", "FILE", text)
-    option(known, "--measured", "FILE", "CSV of measurements already taken: plan the next ones")
+    option(known, "--measured", "FILE", "table of measurements already taken: plan the next ones")
     search = parser.add_argument_group("search")
     text = "share of the criterion for accuracy everywhere, 0 … 1; 0 is the paper's"
     text += f" ({PAPERS_SHARE:g}; {GENERAL_SHARE:g} with a whole error model)"
@@ -274,7 +280,7 @@ def _add_criteria(group: Group) -> None:
     option(group, "--criterion", None, text, "test_pose", choices=CRITERIA)
     text = "mix in the efficiency by another criterion with this share (below 1); repeat for several"
     group.add_argument("--compound", action="append", default=[], metavar="NAME=SHARE", help=text)
-    option(group, "--candidates", "FILE", "CSV of joint configurations to choose from, one per row")
+    option(group, "--candidates", "FILE", "table of joint configurations to choose from, one per row")
     text = "older word for --error-model: on is typical, off is paper"
     option(group, "--discrepancy", None, text, "auto", choices=("auto", "on", "off"))
     switch(group, "--repeat-candidates", "a candidate may be chosen more than once")

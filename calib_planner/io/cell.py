@@ -213,7 +213,7 @@ def _direction(node: Node) -> tuple[float, float, float]:
 CELL_KEYS: dict[str, Key] = {
     "robot": Key(_robot, "path, or name of a shipped robot", "URDF or robot YAML"),
     "base-link": Key(Node.text, "name", "first link of the chain in a URDF (its root)"),
-    "tip-link": Key(Node.text, "name", "last link of the chain in a URDF (its only leaf)"),
+    "tip-link": Key(Node.text, "name", "last link of the chain in a URDF (its only end, or tool0)"),
     "targets": Key(
         _rows(_lengths), "[x, y, z], or a list of these [m]", "reflectors in the frame of the last link"
     ),
@@ -232,7 +232,7 @@ CELL_KEYS: dict[str, Key] = {
     "accuracy-frame": Key(lambda node: node.choice(ACCURACIES), "world or robot", "what an accuracy is"),
     "required-accuracy": Key(lambda node: node.quantity("m"), "length [m]", "largest acceptable error at a pose"),
     "test-pose": Key(_rows(_numbers), "[q1, …, qn], or a list of these [rad | m]", "where accuracy matters"),
-    "test-path": Key(_file, "path", "CSV of further test poses"),
+    "test-path": Key(_file, "path", "table of further test poses"),
     "units": Key(_some_of(UNITS), "mm, deg or mm,deg", "of data files and of angles in arguments (m and rad)"),
     "speed": Key(_above_zero(100, " rad/s or m/s"), "number [rad/s | m/s]", "largest speed of every joint"),
     "speed-share": Key(_above_zero(1, ""), "share", "of the speed limits in the URDF, instead of speed"),
