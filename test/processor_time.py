@@ -21,10 +21,15 @@ MOST = 60
 """So many lines are printed, the costliest ones."""
 
 
+def used_seconds(who: int) -> float:
+    """Processor time [s] that this process (``RUSAGE_SELF``) or its ended children (``RUSAGE_CHILDREN``) used."""
+    usage = resource.getrusage(who)
+    return usage.ru_utime + usage.ru_stime
+
+
 def processor_seconds() -> float:
     """Processor time [s] that this process and its ended children have used."""
-    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+    return used_seconds(resource.RUSAGE_SELF) + used_seconds(resource.RUSAGE_CHILDREN)
 
 
 def file_of(test: str) -> str:
@@ -55,6 +60,7 @@ class ProcessorTime:
     def __init__(self) -> None:
         self._before = 0.0
         self._apart = 0.0
+        self._workers = 0.0
 
     def _lap(self) -> float:
         """Processor time [s] since the last call."""
@@ -76,10 +82,13 @@ class ProcessorTime:
         self._apart += self._lap()
         if output is not None:
             output["processor_seconds_apart"] = self._apart
+        elif self._workers:
+            # Workers are children that have ended: what they used is counted by themselves.
+            self._apart = used_seconds(resource.RUSAGE_SELF)
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node: Any) -> None:
-        self._apart += getattr(node, "workeroutput", {}).get("processor_seconds_apart", 0.0)
+        self._workers += getattr(node, "workeroutput", {}).get("processor_seconds_apart", 0.0)
 
     def pytest_terminal_summary(self, terminalreporter: Any, config: pytest.Config) -> None:
         if config.option.collectonly:
@@ -93,7 +102,7 @@ class ProcessorTime:
                     row[0] += report.when == "call"
                     row[1] += report.processor_seconds
                     row[2] += report.duration
-        rows["start, collection, end"] = [0, self._apart, 0.0]
+        rows["start, collection, end"] = [0, self._apart + self._workers, 0.0]
         rows["together"] = [sum(column) for column in zip(*rows.values(), strict=True)]
         terminalreporter.section("processor time")
         terminalreporter.write_line(f"{'processor s':>12} {'clock s':>9} {'tests':>6}")

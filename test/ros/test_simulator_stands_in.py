@@ -20,6 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from calib_planner import Robot
 from calib_planner.planning import Pace, smooth_trajectory
+from calib_planner.ros.executor import check_executable
 from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.nodes.executor import ExecutorNode
 from calib_planner.ros.nodes.simulator import PREEMPTED, SimulatorNode
@@ -157,6 +158,26 @@ def test_stopped_by_a_service(bench: Bench) -> None:
     assert cell.call("stop").message == "the robot stops"
     result = cell.end(handle).result
     assert (result.status, result.message) == (result.STOPPED, "somebody called ~/stop")
+
+
+def test_stopped_before_it_moves(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = Cell(bench, joint_speed=0.1)
+    said: list[str] = []
+
+    def checked(*given: Any) -> None:
+        check_executable(*given)
+        said.append(cell.node._halt())
+
+    monkeypatch.setattr("calib_planner.ros.nodes.simulator.check_executable", checked)
+    client = bench.action(ExecutePlan, "tracker_simulator/execute_plan")
+    plan = ExecutePlan.Goal(plan=plan_to_message(plan_of(ROBOT, Q), "p", 0, "base"))
+    result = cell.end(bench.goal(client, plan)).result
+    assert (said, result.status) == (["the robot stops"], result.STOPPED)
+    assert result.message == "somebody called ~/stop"
+    monkeypatch.undo()
+    handle = bench.goal(client, plan)
+    bench.future(handle.cancel_goal_async())
+    assert cell.end(handle).result.status == result.CANCELLED, "a stop is of one motion only"
 
 
 @needs_control

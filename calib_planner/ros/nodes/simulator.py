@@ -80,7 +80,8 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
     THREADS = 5
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
-        self._work, self._halted = OneAtATime(), threading.Event()
+        self._work = OneAtATime()
+        self._stops = self._stops_before = 0  # calls of ~/stop, and those before the present motion was asked for
         self._following: ServerGoalHandle | None = None
         self._locked, self._lost, self._said = True, False, 0
         self._present = threading.Lock()  # a tour begins and ends after everything that was sampled
@@ -176,8 +177,13 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         """End what the robot does."""
         if self._work.ended and self._following is None:
             return "the robot stands already"
-        self._halted.set()
+        self._stops += 1
         return "the robot stops"
+
+    @property
+    def _halted(self) -> bool:
+        """Whether somebody called ``~/stop`` since the present motion was asked for."""
+        return self._stops != self._stops_before
 
     def _restore_beam(self) -> str:
         with self._present:
@@ -185,11 +191,12 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         return "the tracker holds the target again" if lost else "the beam was not lost"
 
     def _on_goal(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
-        kind = ExecutePlan.Result
+        kind, stops = ExecutePlan.Result, self._stops
         with self._work.turn() as mine:
             if not mine or self._following is not None:
                 goal.abort()
                 return kind(status=kind.BUSY, message="another plan is being executed: wait for it or cancel it")
+            self._stops_before = stops
             try:
                 result = self._execute(goal)
                 self.outcome("newest plan", OK, result.message or "ended")
@@ -232,7 +239,6 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             shortest=1.0 / self.settings.value.joint_rate,
         )
         self.get_logger().info(f"executing {len(plan.configurations)} configurations, {tour.seconds:.1f} s")
-        self._halted.clear()
         with self._present:
             began = self.now
             self._itinerary.begin(tour, began)
@@ -248,7 +254,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         if early and goal.is_cancel_requested:
             result.status, result.message = ExecutePlan.Result.CANCELLED, "stopped on request"
             goal.canceled()
-        elif early and self._halted.is_set():
+        elif early and self._halted:
             result.status, result.message = ExecutePlan.Result.STOPPED, "somebody called ~/stop"
             goal.abort()
         elif early:
@@ -265,7 +271,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
     def _watch(self, goal: ServerGoalHandle, tour: Tour, began: int, total: int) -> None:
         """Send feedback until the tour that began at ``began`` [ns] ends, by itself or early."""
         while (seconds := (self.now - began) / NANO) < tour.seconds:
-            if goal.is_cancel_requested or self._work.closing.is_set() or self._halted.is_set() or self._lost:
+            if goal.is_cancel_requested or self._work.closing.is_set() or self._halted or self._lost:
                 return
             phase = tour.at(seconds)
             word = "MEASURING" if phase.measuring else "MOVING"
@@ -306,7 +312,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def _on_accepted(self, handle: ServerGoalHandle) -> None:
         """Begin; a goal that is under way ends, since there is a newer one."""
-        self._halted.clear()
+        self._stops_before = self._stops
         self._following = handle
         handle.execute()
 
@@ -327,7 +333,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             if self._is_newest(goal):
                 self._itinerary.begin(Followed(way), began)
         while (seconds := (self.now - began) / NANO) < way.seconds and self._is_newest(goal):
-            if goal.is_cancel_requested or self._work.closing.is_set() or self._halted.is_set():
+            if goal.is_cancel_requested or self._work.closing.is_set() or self._halted:
                 break
             goal.publish_feedback(self._trajectory_feedback(way, seconds))
             self.rest(min(FEEDBACK_PERIOD, way.seconds - seconds), self._work.closing)
@@ -335,7 +341,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
             if not self._is_newest(goal):
                 return self._left(goal, kind(error_code=kind.INVALID_GOAL, error_string=PREEMPTED))
             self._itinerary.halt(self.now)
-        if goal.is_cancel_requested or self._halted.is_set() or self._work.closing.is_set():
+        if goal.is_cancel_requested or self._halted or self._work.closing.is_set():
             return self._left(goal, kind(error_code=kind.INVALID_GOAL, error_string="stopped on request"))
         return self._left(goal, kind())
 
