@@ -17,12 +17,14 @@ test: setup ## run every test, in one process more than there are cores (PYTEST=
 
 prove: setup ## every test with all its seeds and turns, of which make test takes a sample; then fuzz
 	@CALIB_PLANNER_PROVE=1 $(MAKE) test
-	@. ./env.sh && if python -c 'import atheris' 2>/dev/null; then $(MAKE) fuzz; \
-	  else echo "make prove: nothing fuzzed, pip install atheris into .venv first"; fi
+	@$(MAKE) fuzz
 
 FUZZ_SECONDS ?= 600
-fuzz: setup ## fuzz every reader and message conversion, ten minutes each (FUZZ_SECONDS=30; FUZZ='urdf plan' for some)
-	@. ./env.sh && python test/fuzz/fuzz.py --seconds $(FUZZ_SECONDS) $(FUZZ)
+fuzz: setup ## fuzz every reader and message conversion, ten minutes each (FUZZ='urdf plan' for some, '--total 30' for all in turn)
+	@. ./env.sh && if ! python -c 'import atheris' 2>/dev/null; then \
+	  echo "make fuzz: installing atheris into .venv" && \
+	  python -m pip install --quiet --disable-pip-version-check -r requirements/fuzz.txt; fi && \
+	  python test/fuzz/fuzz.py --seconds $(FUZZ_SECONDS) $(FUZZ)
 
 mutation: setup ## mutants of formulas that no test catches; all take a day (MUTATION='--sample 20'; JSON to results/)
 	@. ./env.sh && OMP_NUM_THREADS=1 python tools/mutation.py $(MUTATION)

@@ -4,8 +4,11 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 from pathlib import Path
 
+import fuzz
 import numpy as np
 import pytest
 from robots import repeats
@@ -58,3 +61,20 @@ def test_messages(name: str) -> None:
     rng = np.random.default_rng(0)
     for _ in range(repeats(60, 20_000)):
         TARGETS[name](rng.bytes(int(rng.integers(0, 200))))
+
+
+def test_what_failed_can_be_run_again_from_what_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = b"\x00\xffl1: {\n" * 3
+    failed = tmp_path / "failed-prior-crash-1"
+    failed.write_bytes(data)
+    text = fuzz.repeat(failed, "prior")
+    again = tmp_path / "again"
+    again.write_bytes(gzip.decompress(base64.b64decode(text.split("echo ")[1].split(" | ")[0])))
+    assert again.read_bytes() == data and text.endswith("prior")
+
+    seen: list[bytes] = []
+    monkeypatch.setitem(TARGETS, "prior", seen.append)
+    monkeypatch.setattr("sys.argv", ["fuzz.py", "--input", str(again), "prior"])
+    assert fuzz.main() == 0 and seen == [data]
