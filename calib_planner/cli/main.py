@@ -70,13 +70,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = next((w for w in words if w in COMMANDS), "")
     try:
         args = parse(words, command)
+        from calib_planner.cli.terminal import Terminal  # rich, 0.1 s, which --help does not wait for
+
+        terminal = Terminal(json_wanted=args.json)
     except SystemExit as end:  # of --help and --version
         return int(end.code or DONE)
     except CalibPlannerError as error:
         return _failed("--json" in words, command, error)
-    from calib_planner.cli.terminal import Terminal  # rich, 0.1 s, which --help does not wait for
-
-    terminal = Terminal(json_wanted=args.json)
+    except KeyboardInterrupt:  # while what the command needs is imported
+        _tell("--json" in words, command, "interrupted")
+        return INTERRUPTED
     try:
         args.run(args, terminal)
         sys.stdout.flush()

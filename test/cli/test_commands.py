@@ -178,6 +178,19 @@ def test_interrupt(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == "calib-planner plan: interrupted\n"
 
 
+def test_ctrl_c_while_modules_are_imported_is_one_line_and_130(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("calib_planner.cli.main"), "import_module", interrupted)
+    assert main(["demo", "--json"]) == 130
+    printed = capsys.readouterr()
+    assert printed.err == "calib-planner demo: interrupted\n"
+    assert json.loads(printed.out)["error"]["message"] == "interrupted"
+
+
 # ── real data ────────────────────────────────────────────────────────────────────────────────────────
 
 IRB = SHARED_DATA / "irb120_tracker"
