@@ -321,7 +321,8 @@ class Measuring:
         if message.status not in (Measurement.ACCEPTED, Measurement.REJECTED_OUTLIER):
             if known:
                 return state.withdrawn(int(message.id), cut(message.reason, 300) or "undone")
-            self._rejected(message)
+            if message.status != Measurement.REJECTED_UNDONE:  # told again: not of the visit under way
+                self._rejected(message)
             return state
         self._spoilt = ""
         if known:

@@ -362,6 +362,11 @@ class Session:
         return next((r.frame for r in self.records if r.frame), "")
 
     @property
+    def told(self) -> list[Record]:
+        """What whoever missed something has to hear: the measurements in use, and those withdrawn on request."""
+        return sorted((*self.records, *self._withdrawn), key=lambda r: r.number)
+
+    @property
     def accepted(self) -> list[Record]:
         """The accepted measurements, in the order of measuring."""
         return [r for r in self.records if r.status == ACCEPTED]

@@ -323,12 +323,14 @@ def test_undone_measurements_are_made_again_and_nonsense_is_refused(bench: Bench
         {"number": 104, "points": []},
         {"number": 105, "plan_id": "another"},
         {"number": 106, "status": 250},
+        {"number": 107, "status": Measurement.REJECTED_UNDONE, "reason": "long ago"},
     ]
     for others in rubbish:
         cell.publish(first, **others)
     cell.publish(first, number=1, status=Measurement.REJECTED_UNDONE, reason="undone")
     bench.wait(lambda: desk.now.measured == 2)
     assert {r.number for r in desk.node.campaign.measurements} == {2, 3}
+    assert desk.node._measuring.visit.reason != "long ago", "what nobody knows was not undone at this visit"
     cell.number = 200
     assert desk.call("pause")[0] and desk.call("resume")[0]
     done = desk.until(S.DONE)

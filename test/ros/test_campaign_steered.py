@@ -192,6 +192,32 @@ def test_what_an_identifier_accepted_before_a_crash_is_not_measured_again(bench:
     assert len(state.measurements) == again.measured + again.validated and again.validated == 3
 
 
+def test_what_was_undone_while_the_campaign_was_away_is_measured_again(
+    bench: Bench, cell: FakeCell, tmp_path: Path
+) -> None:
+    """The identifier tells it with the plan; what the campaign never knew changes nothing."""
+    cell.answer = lambda q: "hang" if len(cell.visited) == 4 else "ok"
+    desk = Desk(bench, store_folder=str(tmp_path), attempts=1)
+    assert desk.call("start")[0]
+    bench.wait(lambda: len(cell.visited) == 4)
+    desk.until(S.MEASURING, measured=3)
+    desk.transitions("deactivate", "cleanup")
+    undone = {"status": Measurement.REJECTED_UNDONE, "reason": "withdrawn on request"}
+    first = cell.visited[0]
+    cell.untold += [(first, undone | {"number": 1}), (first, undone | {"number": 99})]
+    cell.answer = lambda q: "ok"
+    desk.transitions("configure", "activate")
+    desk.until(S.PAUSED, measured=3)
+    assert desk.call("resume")[0]
+    bench.wait(lambda: desk.node.campaign.failures)
+    cell.number = 200
+    done = desk.until(S.DONE)
+    state = desk.node.campaign
+    assert 1 not in {r.number for r in state.measurements}
+    assert [reason for _, reason in state.failures] == ["withdrawn on request"]
+    assert done.outcome == S.OUTCOME_REACHED
+
+
 # ── goals and counters ───────────────────────────────────────────────────────────────────────────────
 
 

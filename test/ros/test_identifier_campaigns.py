@@ -12,13 +12,14 @@ from bench import Bench
 from calib_planner_msgs.msg import Measurement
 from calib_planner_msgs.msg import Plan as PlanMessage
 from robots import plan_of, random_configurations
-from shift import Estimate, Shift, change
+from shift import NAME, Estimate, Shift, change
 
 from calib_planner import Plan, Robot
 from calib_planner.acquisition import NANO
 from calib_planner.campaign import FIT, VALIDATION
 from calib_planner.io import read_data
 from calib_planner.ros.messages import plan_to_message
+from calib_planner.ros.parameters import HISTORY
 
 ROBOT = Robot.load("planar_2r").with_parameters("lengths+offsets")
 PLAN = plan_of(ROBOT, random_configurations(ROBOT, 5, 3))
@@ -84,6 +85,32 @@ def test_two_campaigns_and_a_validation(shift: Shift, tmp_path: Path) -> None:
     measured(shift, PLAN, 4)
     shift.bench.wait(lambda: shift.estimates[-1].measurements == 4)
     assert saved(shift, tmp_path) == rows | {"measurements_two-fit": 4}
+
+
+def undone(shift: Shift, fitted: list[Measurement]) -> dict[int, int]:
+    """Withdraw the newest measurement; number → status of all."""
+    assert shift.service("undo").success
+    shift.bench.wait(lambda: shift.measurements[-1].status == Measurement.REJECTED_UNDONE)
+    return {m.id: m.status for m in (*fitted, shift.measurements[-1])}
+
+
+def test_what_was_measured_is_told_again_after_a_restart(shift: Shift) -> None:
+    """To a page that comes late; nobody tells a plan of a campaign."""
+    shift.announce(PLAN)
+    expected = undone(shift, measured(shift, PLAN, 3))
+    restart(shift)
+    late = shift.bench.hear(Measurement, f"{NAME}/measurements", HISTORY)
+    shift.bench.wait(lambda: len(late) >= 3)
+    assert {m.id: m.status for m in late} == expected
+
+
+def test_a_campaign_that_was_away_hears_what_was_undone(shift: Shift) -> None:
+    announce(shift, "one")
+    expected = undone(shift, measured(shift, PLAN, 2))
+    before = len(shift.measurements)
+    shift.plans.publish(plan_to_message(PLAN, "one-fit", 0, "base", "one", FIT))
+    shift.bench.wait(lambda: len(shift.measurements) == before + 2)
+    assert {m.id: m.status for m in shift.measurements[before:]} == expected
 
 
 def test_a_bag_that_is_played_twice_counts_once(shift: Shift, tmp_path: Path) -> None:

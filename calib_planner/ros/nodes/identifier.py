@@ -193,6 +193,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         for target, locked in self._locked.items():
             self._intake.tracker_state(target, locked)
         self._keep_frame()
+        self._tell_all()
         self.create_steady_timer(chosen.diagnostics_period, self._tick)
         self._update()
         ready = self._waiting if self._session is None else f"ready to identify {self._session.robot.name}"
@@ -266,6 +267,7 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self._enter_session(model)
         if plan is not None:
             self._begin(plan)
+        self._tell_all()
         self._update()
 
     def _on_plan(self, message: PlanMessage) -> None:
@@ -290,9 +292,8 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
                 role=received.purpose,
                 keep=chosen.keep_measurements,
             )
-            if received.campaign_id and self._intake is not None:
-                for record in session.records:  # whoever tells the plan may have missed some of them
-                    self._output.tell(session, record)
+            if received.campaign_id:
+                self._tell_all()
             if not new:
                 return
         except CalibPlannerError as error:
@@ -304,6 +305,15 @@ class IdentifierNode(ManagedNode[IdentifierParameters]):
         self.get_logger().info(f"{text}; {before} were there of the plan before" if before else text)
         self._keep_frame()
         self._update()
+
+    def _tell_all(self) -> None:
+        """While active: tell what was measured once more, to whoever missed some of it.
+
+        That is a campaign that was away and tells its plan again, or a page that comes after a restart.
+        """
+        if self._session is not None and self._intake is not None:
+            for record in self._session.told:
+                self._output.tell(self._session, record)
 
     def _refuse_plan(self, plan_id: str, error: CalibPlannerError) -> None:
         self.get_logger().error(f"plan {brief(plan_id, 40)} refused: {cut(error)}", throttle_duration_sec=1.0)
