@@ -26,8 +26,8 @@ fuzz: setup ## fuzz every reader and message conversion, ten minutes each (FUZZ=
 	  python -m pip install --quiet --disable-pip-version-check -r requirements/fuzz.txt; fi && \
 	  python test/fuzz/fuzz.py --seconds $(FUZZ_SECONDS) $(FUZZ)
 
-mutation: setup ## mutants of formulas that no test catches; all take a day (MUTATION='--sample 20'; JSON to results/)
-	@. ./env.sh && OMP_NUM_THREADS=1 python tools/mutation.py $(MUTATION)
+mutation: setup ## mutants of formulas that no test catches; all take hours (MUTATION='--sample 20'; JSON to results/)
+	@. ./env.sh && OMP_NUM_THREADS=1 python tools/mutation $(MUTATION)
 
 docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
 	@. ./env.sh && python tools/reference && \
