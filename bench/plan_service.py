@@ -30,7 +30,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from calib_planner import PlanProblem, Robot, plan
-from calib_planner.io import read_error_model
+from calib_planner.io import planned_error_model
 from calib_planner.planning import Search
 from calib_planner.ros.messages import seconds_of
 from calib_planner.ros.processes import Nodes, own_domain
@@ -77,9 +77,8 @@ def measure(client: Client, model: str, configurations: int, requests: int) -> d
     poses = [JointConfiguration(positions=POSE.tolist())]
     request = PlanRequest(test_poses=poses, configurations=configurations, error_model=model, sigma=SIGMA)
     robot = Robot.load(ROBOT).with_parameters("lengths+offsets")
-    problem = PlanProblem(
-        robot, POSE, configurations, noise=SIGMA, error_model=read_error_model(model), search=Search()
-    )
+    expected = planned_error_model(model, robot, SIGMA)
+    problem = PlanProblem(robot, POSE, configurations, error_model=expected, search=Search())
     beside, difference, library = [], [], []
     for turn in range(requests + 1):
         began = time.perf_counter()
