@@ -81,7 +81,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def __init__(self, context: Context | None = None, overrides: Sequence[Parameter] = ()) -> None:
         self._work = OneAtATime()
-        self._stops = self._stops_before = 0  # calls of ~/stop, and those before the present motion was asked for
+        self._halts = self._halts_before = 0  # calls of ~/stop, and those before the present motion was wanted
         self._following: ServerGoalHandle | None = None
         self._locked, self._lost, self._said = True, False, 0
         self._present = threading.Lock()  # a tour begins and ends after everything that was sampled
@@ -177,13 +177,13 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         """End what the robot does."""
         if self._work.ended and self._following is None:
             return "the robot stands already"
-        self._stops += 1
+        self._halts += 1
         return "the robot stops"
 
     @property
     def _halted(self) -> bool:
-        """Whether somebody called ``~/stop`` since the present motion was asked for."""
-        return self._stops != self._stops_before
+        """Whether somebody called ``~/stop`` since the present motion was wanted."""
+        return self._halts != self._halts_before
 
     def _restore_beam(self) -> str:
         with self._present:
@@ -191,12 +191,12 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
         return "the tracker holds the target again" if lost else "the beam was not lost"
 
     def _on_goal(self, goal: ServerGoalHandle) -> ExecutePlan.Result:
-        kind, stops = ExecutePlan.Result, self._stops
+        kind, halts = ExecutePlan.Result, self._halts
         with self._work.turn() as mine:
             if not mine or self._following is not None:
                 goal.abort()
                 return kind(status=kind.BUSY, message="another plan is being executed: wait for it or cancel it")
-            self._stops_before = stops
+            self._halts_before = halts
             try:
                 result = self._execute(goal)
                 self.outcome("newest plan", OK, result.message or "ended")
@@ -312,7 +312,7 @@ class SimulatorNode(ManagedNode[SimulatorParameters]):
 
     def _on_accepted(self, handle: ServerGoalHandle) -> None:
         """Begin; a goal that is under way ends, since there is a newer one."""
-        self._stops_before = self._stops
+        self._halts_before = self._halts
         self._following = handle
         handle.execute()
 
