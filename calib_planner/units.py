@@ -111,7 +111,10 @@ def quantity(text: str, unit: str = "m") -> float:
         hint = "; use a decimal point" if re.fullmatch(r"\s*[-+]?\d+,\d+\s*\D*", text) else ""
         raise ValueError(f"expected a number [{unit}], or one with its unit ({examples}), got {text!r}{hint}")
     # In decimals: 0.03 mm is 3e-05 m, and not 2.9999999999999997e-05.
-    return float(Decimal(match[1]) / Decimal(repr(others[match[2] or unit])))
+    try:
+        return float(Decimal(match[1]) / Decimal(repr(others[match[2] or unit])))
+    except ArithmeticError:  # an exponent of six digits: infinite or zero in any unit
+        return float(match[1])
 
 
 def length(metres: float) -> str:

@@ -233,7 +233,8 @@ def _noise(node: Node) -> PointNoise | None:
 def _placement_alone(top: Node, names: tuple[str, ...]) -> FloatArray | None:
     if "placement_alone" not in top:
         return None
-    return _in_order(top["placement_alone"]["parameters"], names)
+    alone = top["placement_alone"].mapping(None, ("parameters",))
+    return _in_order(alone["parameters"], names)
 
 
 def _learnt(node: Node) -> SavedKnowledge | None:

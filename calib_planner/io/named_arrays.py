@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from calib_planner.errors import FileFormatError
+from calib_planner.io.mat import check_elements
 from calib_planner.io.text import RawLines
 from calib_planner.units import listed
 
@@ -58,7 +59,11 @@ def read_mat(path: str | Path, data: bytes) -> RawLines:
     """Variables of a MATLAB file up to version 7, also the fields of one struct."""
     from scipy.io import loadmat  # 0.1 s, which other files do not pay for
 
-    variables = _loaded(path, lambda: loadmat(io.BytesIO(data), squeeze_me=False, struct_as_record=True), "MAT")
+    def load() -> Any:
+        check_elements(data)
+        return loadmat(io.BytesIO(data), squeeze_me=False, struct_as_record=True)
+
+    variables = _loaded(path, load, "MAT")
     arrays: dict[str, Any] = {}
     for name, value in variables.items():
         if name.startswith("__"):
@@ -123,7 +128,11 @@ def _records(path: str | Path, key: str, rows: Sequence[Mapping[str, Any]]) -> l
     if any(isinstance(v, dict) for v in values):
         inner = list(dict.fromkeys(k for v in values if isinstance(v, dict) for k in v))
         return [[v.get(k) for k in inner] if isinstance(v, dict) else [None] * len(inner) for v in values]
-    sizes = {np.shape(v) for v in values if isinstance(v, list)}
+    sizes: set[tuple[int, ...]]
+    try:
+        sizes = {np.shape(v) for v in values if isinstance(v, list)}
+    except ValueError:  # lists of different lengths within one record
+        sizes = {(), (1,)}
     if len(sizes) > 1:
         got = f"{key!r} of different lengths"
         raise FileFormatError(

@@ -5,11 +5,17 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from calib_planner.errors import FileFormatError, MissingExtraError
 from calib_planner.io.text import RawLines
+
+MOST_ROWS = 1 << 20
+"""Rows of a sheet that Excel and LibreOffice have."""
+MOST_VALUES = 20_000_000
+"""Cells, as many as ``named_arrays`` takes numbers."""
 
 
 def read_xlsx(path: str | Path, data: bytes, what: str) -> RawLines:
@@ -25,7 +31,7 @@ def read_xlsx(path: str | Path, data: bytes, what: str) -> RawLines:
         raise MissingExtraError("files", "openpyxl", "reading XLSX files") from None
     try:
         book = load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-        sheets = {s.title: [list(row) for row in s.iter_rows(values_only=True)] for s in book.worksheets}
+        sheets = {s.title: _rows(s.iter_rows(values_only=True)) for s in book.worksheets}
     except Exception as error:  # openpyxl lets through what zipfile and its XML parser raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         advice = "open it in a spreadsheet program and save it again"
@@ -41,6 +47,21 @@ def read_xlsx(path: str | Path, data: bytes, what: str) -> RawLines:
     sheet = f"sheet {best!r}" if len(sheets) > 1 else "one sheet"
     texts = ["\t".join(map(_text, row)).rstrip("\t") for row in sheets[best]]
     return RawLines(str(path), f"XLSX, {sheet}", texts, "row", "\t")
+
+
+def _rows(read: Iterable[Sequence[Any]]) -> list[list[Any]]:
+    """The rows of a sheet. Rows that are not in the file are empty: a number of a row may make endlessly many.
+
+    Raises:
+        ValueError: More than a spreadsheet program makes.
+    """
+    rows, cells = [], 0
+    for row in read:
+        rows.append(list(row))
+        cells += len(row)
+        if len(rows) > MOST_ROWS or cells > MOST_VALUES:
+            raise ValueError(f"more than {MOST_ROWS} rows or {MOST_VALUES} cells")
+    return rows
 
 
 def _is_number(value: Any) -> bool:
