@@ -525,7 +525,9 @@ def idle_status(reason: str) -> CampaignStatus:
     return CampaignStatus(state=CampaignStatus.IDLE, reason=cut(reason), **dict.fromkeys(NUMBERS, NAN))
 
 
-def status_message(state: CampaignState, campaign_id: str, waiting: str, reason: str) -> CampaignStatus:
+def status_message(
+    state: CampaignState, campaign_id: str, waiting: str, reason: str, *, planning: bool = False
+) -> CampaignStatus:
     """The status of a campaign, without stamp.
 
     Args:
@@ -533,6 +535,7 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
         campaign_id: Its name.
         waiting: What it waits for; empty if for nothing.
         reason: What else there is to say.
+        planning: Whether the rest is planned anew while the campaign is paused.
     """
     problem, action, last = state.problem, state.action, state.rounds[-1] if state.rounds else None
     allowed = max(problem.fit_budget - state.spent(FIT), 0)
@@ -540,7 +543,7 @@ def status_message(state: CampaignState, campaign_id: str, waiting: str, reason:
     message = CampaignStatus(
         campaign_id=campaign_id,
         robot=problem.robot.name,
-        state=_state(state, waiting),
+        state=CampaignStatus.PLANNING if planning else _state(state, waiting),
         outcome=OUTCOME[state.outcome],
         round=len(state.rounds),
         measured=len(state.measurements_of(FIT)),

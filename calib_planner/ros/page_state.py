@@ -554,8 +554,8 @@ def _now(state: PageState) -> dict[str, Any]:
             word, title = "review", "Look at the planned configurations, then press Resume."
             reason = "Choose one to see it. Leave out or replace what the robot should not do."
         elif not done and campaign.round:
-            word, title = "review", "Paused. Configurations are planned anew, and come here."
-            reason = "Wait for them, or press Resume and go on without a look."
+            word, title = "review", "Paused: no planned configuration is left."
+            reason = "Press Resume, and others are planned."
     elif campaign.state == S.DONE:
         title = OUTCOMES.get(campaign.outcome, OUTCOMES[S.OUTCOME_OPEN])
     else:

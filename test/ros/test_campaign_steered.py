@@ -68,9 +68,13 @@ def test_the_first_plan_is_looked_at_left_out_and_replaced(bench: Bench, cell: F
     assert set(desk.now.ahead) <= set(first.ahead) - {gone} and desk.now.state == S.PAUSED
     assert skip(desk, gone).status == Answer.UNKNOWN_INDEX
     replaced = desk.now.ahead[-1]
+    begun = len(desk.heard)
     assert skip(desk, replaced, replace=True).status == Answer.SUCCESS
     bench.wait(lambda: desk.now.round == 2 and desk.now.excluded == 2)
     assert desk.now.state == S.PAUSED and not set(desk.now.ahead) & set(first.ahead)
+    assert "paused for review" in desk.now.reason
+    planning = [m for m in desk.heard[begun:] if m.state == S.PLANNING]
+    assert planning and all("planned anew" in m.reason and not m.ahead for m in planning)
     second = ahead(desk.now)
     assert not cell.visited and len(second) >= len(ahead(first)) - 1
     assert desk.call("resume")[0]

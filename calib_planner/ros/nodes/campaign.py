@@ -322,11 +322,17 @@ class CampaignNode(ManagedNode[CampaignParameters]):
                 self._pause_for(f"{measuring.waiting}; call ~/resume once that is remedied")
             return
         measuring.leave()
-        wanted = not isinstance(action, Paused) or (self._replanning and not state.queue)
+        wanted = not isinstance(action, Paused) or self._plans_anew
         if isinstance(action, Finished):
             self._finish(action.result)
         elif wanted and self._work is None:
             self._work, self._work_for = self._thread.submit(decide, state, self._ending_plan.is_set), self._id
+
+    @property
+    def _plans_anew(self) -> bool:
+        """Whether the rest is planned anew, around what was replaced, while the campaign is paused."""
+        state = self.campaign
+        return self._replanning and state is not None and state.paused and not state.queue
 
     def _take_step(self) -> None:
         if self._work is None or not self._work.done() or self.campaign is None:
@@ -347,10 +353,13 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         self._review()
 
     def _review(self) -> None:
-        """With ``review``: pause once, when the first plan is there and before anything is measured."""
+        """With ``review``: pause when the first plan is there, and before anything is measured.
+
+        What was planned anew while it was paused is looked at as well; what comes after ``~/resume`` is not.
+        """
         state = self.campaign
-        first = state is not None and bool(state.queue) and not state.measurements and not self._reviewed
-        if state is None or not first or not self.settings.value.review:
+        first = state is not None and bool(state.queue) and not state.measurements
+        if state is None or not first or not self.settings.value.review or (self._reviewed and not state.paused):
             return
         self._reviewed = True
         self._set(state.pause())
@@ -409,7 +418,9 @@ class CampaignNode(ManagedNode[CampaignParameters]):
         if self.campaign is None:
             message = idle_status(self._reason)
         else:
-            message = status_message(self.campaign, self._id, self._measuring.waiting, self._reason)
+            anew = self._plans_anew
+            reason = "the rest is planned anew, and waits for ~/resume" if anew else self._reason
+            message = status_message(self.campaign, self._id, self._measuring.waiting, reason, planning=anew)
         text = repr(message)
         self._told = message
         if text != self._sent:
