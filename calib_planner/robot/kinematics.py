@@ -125,34 +125,34 @@ class Tracer:
         self.is_vector: list[bool] = [False]
         self._known: dict[tuple[str, int, int], int] = {}
 
-    def node(self, op: str, a: int, b: int = 0, vector: bool = False) -> Ref:
+    def node(self, op: str, a: int, b: int = 0, vector: bool | None = None) -> Ref:
+        """The node of an operation; ``vector`` is said where ``a`` and ``b`` are no nodes."""
         key = (op, a, b)
-        if key not in self._known:
-            self._known[key] = len(self.nodes)
+        number = self._known.get(key)
+        if number is None:
+            number = self._known[key] = len(self.nodes)
             self.nodes.append(key)
-            self.is_vector.append(vector)
-        return 1, self._known[key]
+            self.is_vector.append(self.is_vector[a] or self.is_vector[b] if vector is None else vector)
+        return 1, number
 
     def mul(self, x: Ref, y: Ref) -> Ref:
-        sign = x[0] * y[0]
+        (sign, a), (other, b) = x, y
+        sign *= other
         if sign == 0:
             return ZERO
-        if x[1] == 0 or y[1] == 0:
-            return sign, x[1] or y[1]
-        a, b = sorted((x[1], y[1]))
-        return sign, self.node("mul", a, b, self.is_vector[a] or self.is_vector[b])[1]
+        if a == 0 or b == 0:
+            return sign, a or b
+        return sign, self.node("mul", *((a, b) if a < b else (b, a)))[1]
 
     def add(self, x: Ref, y: Ref) -> Ref:
-        if x[0] == 0 or y[0] == 0:
-            return y if x[0] == 0 else x
-        if x[1] == y[1] and x[0] == -y[0]:
+        (sign, a), (other, b) = x, y
+        if sign == 0 or other == 0:
+            return y if sign == 0 else x
+        if sign == other:
+            return sign, self.node("add", *((a, b) if a < b else (b, a)))[1]
+        if a == b:
             return ZERO
-        vector = self.is_vector[x[1]] or self.is_vector[y[1]]
-        if x[0] == y[0]:
-            a, b = sorted((x[1], y[1]))
-            return x[0], self.node("add", a, b, vector)[1]
-        positive, negative = (x, y) if x[0] > 0 else (y, x)
-        return self.node("sub", positive[1], negative[1], vector)
+        return self.node("sub", *((a, b) if sign > 0 else (b, a)))
 
     def sub(self, x: Ref, y: Ref) -> Ref:
         return self.add(x, (-y[0], y[1]))
@@ -183,7 +183,7 @@ def _walk(
     for index, (kind, joint, sign, code) in enumerate(chain, start=first):
         a = "xyz".index(kind[1])
         axis = frame.axes[a]
-        seen.append((list(axis), list(frame.origin), kind[0] == "R"))
+        seen.append((axis, frame.origin, kind[0] == "R"))  # an element makes new lists
         if joint is None and code == 0:
             continue
         if kind[0] == "T":
@@ -195,9 +195,7 @@ def _walk(
             cos, sin = ((ONE, ZERO), (ZERO, ONE), ((-1, 0), ZERO), (ZERO, (-1, 0)))[code]
         else:
             angle = _amount(tracer, index, joint, code)[1]
-            vector = tracer.is_vector[angle]
-            cos = tracer.node("cos", angle, vector=vector)
-            sin = tracer.node("sin", angle, vector=vector)
+            cos, sin = tracer.node("cos", angle), tracer.node("sin", angle)
         sin = (sin[0] * int(sign), sin[1])
         u, v = frame.axes[(a + 1) % 3], frame.axes[(a + 2) % 3]
         mul, add, sub = tracer.mul, tracer.add, tracer.sub
@@ -208,7 +206,7 @@ def _walk(
 
 def _amount(tracer: Tracer, index: int, joint: int | None, code: int) -> Ref:
     """Symbol of value + δ + q; the constant part is a scalar, the joint's part a vector."""
-    constant = ZERO if code == 0 else tracer.node("amount", index)
+    constant = ZERO if code == 0 else tracer.node("amount", index, vector=False)
     if joint is None:
         return constant
     return tracer.add(tracer.node("joint", joint, vector=True), constant)
@@ -427,8 +425,15 @@ def compile_program(structure: Structure) -> Program:
     program is used.
     """
     shape = (len(structure.branches), len(structure.columns), len(structure.axes))
-    candidates = [_lay_out(*trace(structure, split), shape) for split in (0, first_turn(structure))]
-    return min(candidates, key=lambda program: len(program.vectors) + len(program.copies))
+    traces = [trace(structure, split) for split in dict.fromkeys((0, first_turn(structure)))]
+    return _lay_out(*min(traces, key=lambda traced: _operations(*traced)), shape)
+
+
+def _operations(tracer: Tracer, outputs: list[Ref]) -> int:
+    """Vector operations and copies of the program that ``_lay_out`` makes of a trace."""
+    computed = _computed(tracer, _needed(tracer, outputs))
+    written_in_place = computed & {node for sign, node in outputs if sign > 0}
+    return len(computed) + len(outputs) - len(written_in_place)
 
 
 _SCALARS = ("amount", "cos", "sin", "mul", "add", "sub")
@@ -494,7 +499,7 @@ def _lay_out(tracer: Tracer, outputs: list[Ref], shape: tuple[int, int, int]) ->
     needed = _needed(tracer, outputs)
     rows = len(outputs)
     home: dict[int, int] = {}
-    computed = {n for n in needed if tracer.is_vector[n] and tracer.nodes[n][0] in _UFUNCS}
+    computed = _computed(tracer, needed)
     for row, (sign, node) in enumerate(outputs):
         if sign > 0 and node in computed and node not in home:
             home[node] = row
@@ -555,6 +560,11 @@ def _lay_out(tracer: Tracer, outputs: list[Ref], shape: tuple[int, int, int]) ->
         rows=rows,
         shape=shape,
     )
+
+
+def _computed(tracer: Tracer, needed: list[int]) -> set[int]:
+    """Those nodes that are vector operations."""
+    return {n for n in needed if tracer.is_vector[n] and tracer.nodes[n][0] in _UFUNCS}
 
 
 def _operands(tracer: Tracer, node: int) -> tuple[int, ...]:
