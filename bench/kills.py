@@ -105,7 +105,7 @@ LATER = {
     "ending": 0.05,
     "compacting": 0.004,
 }
-"""Phase → longest time from its beginning to the kill [s], about what it lasts; an inner one hides an outer one."""
+"""Phase → longest time from its beginning to the kill [s], about what it lasts; inner phases hide outer ones."""
 PHASES = tuple(LATER)
 TURNS = {
     "accepting": (1, 2, 3),
@@ -272,6 +272,7 @@ class Heard:
         configurations: How many the newest estimate counts.
         asked: Whether an undo was asked for that nobody has answered.
         shown: (row, first stamp, last stamp) [ns] of every standstill that was shown.
+        stored: (row, first stamp) [ns] of those that the store has, in use or withdrawn.
         stamp: The newest stamp [ns].
     """
 
@@ -280,6 +281,7 @@ class Heard:
     configurations: int = 0
     asked: bool = False
     shown: list[tuple[int, int, int]] = field(default_factory=list)
+    stored: list[tuple[int, int]] = field(default_factory=list)
     stamp: int = 1000 * NANO
 
     def told(self, message: Measurement) -> None:
@@ -342,6 +344,8 @@ def faults(folder: Path, heard: Heard) -> list[tuple[str, str]]:
                 bad.append(("strange", f"{r.number}, row {r.index}, {r.acquired.start}: shown {shown}"))
     heard.accepted = {n: int(r.index or 0) for n, r in in_use.items()}
     heard.undone, heard.asked, heard.configurations = withdrawn, False, len(in_use)
+    starts = [r.acquired.start for r in kept if r.status in (*KEPT, UNDONE)]
+    heard.stored = [(row, first) for row, first, last in heard.shown if any(first <= s <= last for s in starts)]
     return bad
 
 
@@ -445,7 +449,7 @@ class Cell:
 
         for _ in range(5):
             self.show(row, self.heard.stamp + NANO)
-            if self.wait(told, 5.0):
+            if self.wait(told, 20.0):
                 return True
         return False
 
@@ -574,11 +578,9 @@ def act(cell: Cell, life: Life, rng: random.Random, aim: Aim | None) -> None:
     if not cell.ready():
         life.faults.append(("not restarted", "it is not ready"))
         return
-    if aim is not None and heard.shown and rng.random() < 0.25:
-        row, first, _ = rng.choice(heard.shown)
-        if row in heard.accepted.values():
-            life.replayed = True
-            cell.show(row, first)
+    if aim is not None and heard.stored and rng.random() < 0.25:
+        life.replayed = True
+        cell.show(*rng.choice(heard.stored))
     missing = [row for row in range(ROWS) if row not in heard.accepted.values()]
     rng.shuffle(missing)
     soon = aim is not None and aim.phase in ("undoing", "ending", "compacting")
