@@ -5,15 +5,16 @@
     python tools/mutation [--sample N] [--seed S] [--report FILE] [--write] [FILE …]
     make mutation MUTATION='--sample 40 calib_planner/planning/criteria.py'
 
-The mutants are cosmic-ray's, from an environment of its own, since its requirements contradict those of the pages.
-``formulas.py`` says which of them change a formula; the others are left out by that rule. ``runner.py`` tests them
-in forks of a warm process, in a copy of the checkout without the compiled kernels, so that NumPy's formulas run.
+The mutants are cosmic-ray's, from an environment of its own, since its requirements contradict those of the
+pages. ``formulas.py`` says which of them change a formula; the others are left out by that rule. ``runner.py``
+tests them in forks of a warm process, in a copy of the checkout without the compiled kernels, so that NumPy's
+formulas run.
 
 ``test/mutants.yaml`` lists mutants that no test can catch, each with the reason: they give the same values, or
-another way of equal worth to the same end. The tool demands that each entry still is a mutant of its file.
+another, equally good way to the same end. The tool demands that each entry still is a mutant of its file.
 
-``--sample`` draws that many of each file, with a seed; the share of a sample of n has a standard error of at most
-0.5/√n. ``--write`` puts the figures of the report, all files together, into ``docs/proof.md``.
+``--sample`` draws that many of each file, with a seed; the share of a sample of n has a standard error of at
+most 0.5/√n. ``--write`` puts the figures of the report, all files together, into ``docs/proof.md``.
 """
 
 from __future__ import annotations
@@ -43,13 +44,13 @@ PAGE = ROOT / "docs" / "proof.md"
 BEGIN, END = "<!-- mutants: written by tools/mutation --write -->", "<!-- end of mutants -->"
 ROOMS = ("robot", "error_model", "planning", "identification")
 FILES = {
-    "robot": "kinematics elements linearisation coupling chain capsules identifiability inverse limits masses origins "
-    "parameters",
+    "robot": "kinematics elements linearisation coupling chain capsules identifiability inverse limits masses "
+    "origins parameters",
     "error_model": "gravity joint_functions placement visits points knowledge model poses prior truth typical",
     "planning": "criteria information extended bound budget feasibility planner random_plans tour trajectory "
-    "search/apart search/descent search/enumeration search/exchange search/interior search/multistart search/rounding "
-    "search/swaps certify/bernstein certify/branch_and_bound certify/polynomial certify/prove constraints/room "
-    "constraints/tracker constraints/self_collision",
+    "search/apart search/descent search/enumeration search/exchange search/interior search/multistart "
+    "search/rounding search/swaps certify/bernstein certify/branch_and_bound certify/polynomial certify/prove "
+    "constraints/room constraints/tracker constraints/self_collision",
     "identification": "registration likelihood left_out estimation solver doubt alternatives rejection term_gain "
     "validation verdict estimate",
 }
@@ -70,9 +71,8 @@ class CosmicRay:
             pip = [str(python), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
             subprocess.run([*pip, COSMIC_RAY], check=True)
         command = [str(python), str(Path(__file__).parent / "cosmic.py"), str(ROOT / file)]
-        # fmt: off
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8")
-        # fmt: on
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, encoding="utf-8")
         self.specifications: list[list[Any]] = self.answer()
 
     def answer(self) -> Any:
@@ -106,7 +106,7 @@ def copied(folder: Path) -> None:
 
 def change(source: list[str], mutated: list[str], line: int) -> tuple[str, str]:
     """The lines that differ, before and after, without indentation, joined by a blank."""
-    first = next((i for i, (a, b) in enumerate(zip(source, mutated)) if a != b), line - 1)
+    first = next((i for i, (a, b) in enumerate(zip(source, mutated, strict=False)) if a != b), line - 1)
     tail = 0
     while tail < min(len(source), len(mutated)) - first - 1 and source[-1 - tail] == mutated[-1 - tail]:
         tail += 1
@@ -225,7 +225,8 @@ def take(report: dict[str, Any], mutant: dict[str, Any], target: Path) -> None:
 
 def told(file: str, of: dict[str, Any]) -> str:
     left = of["tried"] - len(of["listed"])
-    return f"{file}: {of['caught']} of {left} caught, {len(of['listed'])} listed ({of['mutants']} in all), {of['seconds']:.0f} s"
+    counts = f"{of['caught']} of {left} caught, {len(of['listed'])} listed ({of['mutants']} in all)"
+    return f"{file}: {counts}, {of['seconds']:.0f} s"
 
 
 def page(report: dict[str, Any]) -> str:
@@ -237,7 +238,7 @@ def page(report: dict[str, Any]) -> str:
         for file in (f for f in formula_files() if f in here):
             of = here[file]
             numbers = [of["mutants"], of["tried"], len(of["listed"]), of["caught"]]
-            together = [a + b for a, b in zip(together, numbers)]
+            together = [a + b for a, b in zip(together, numbers, strict=True)]
             rows.append(row(f"`{file.removeprefix('calib_planner/')}`", numbers))
         if together[1]:
             rows.append(row(f"**{room}**", together))

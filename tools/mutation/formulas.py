@@ -4,19 +4,19 @@
 
 A *formula line* is code in a function (or a lambda) that computes. Not counted is what does not compute:
 
-* annotations, decorators, imports, docstrings, text with values in it (f-strings), and whole functions that return
-  text (``-> str``, ``__repr__``);
-* ``raise``, ``assert``, an ``if`` that does nothing but raise, calls of the gatekeepers (``check_…``), warnings and
-  log lines: these guard a formula;
+* annotations, decorators, imports, docstrings, text with values in it (f-strings), and whole functions that
+  return text (``-> str``, ``__repr__``);
+* ``raise``, ``assert``, an ``if`` that does nothing but raise, calls of the gatekeepers (``check_…``), warnings
+  and log lines: these guard a formula;
 * keywords that change no value (``KEYWORDS``).
 
-Some mutations of such lines are left out as well, because they would be caught, or would survive, for a reason that
-says nothing about a test:
+Some mutations of such lines are left out as well, because they would be caught, or would survive, for a reason
+that says nothing about a test:
 
-* arithmetic replaced by a bit operator, and the other way round: a number of type float raises TypeError, and ``&``
-  and ``*`` of masks are the same function;
-* a comparison replaced by identity, or identity by a comparison: ``is None`` and ``== None`` are the same, ``<``
-  with None raises TypeError;
+* arithmetic replaced by a bit operator, and the other way round: a number of type float raises TypeError, and
+  ``&`` and ``*`` of masks are the same function;
+* a comparison replaced by identity, or identity by a comparison: ``is None`` and ``== None`` are the same,
+  ``<`` with None raises TypeError;
 * the kind of exception that is expected.
 """
 
@@ -36,16 +36,13 @@ IDENTITY = {"Is", "IsNot"}
 
 
 def changes_formula(operator: str) -> bool:
-    """Whether a mutation of cosmic-ray can be that of a formula, by its name: ``core/ReplaceBinaryOperator_Add_Sub``."""
+    """Whether a mutation of cosmic-ray can be that of a formula, by its name (``core/NumberReplacer``)."""
     kind, *changed = operator.removeprefix("core/").split("_")
     if kind in ("ExceptionReplacer", "RemoveDecorator"):
         return False
     if any(name in SHIFTS for name in changed):
         return False
-    for names in (BITS, IDENTITY):
-        if len({name in names for name in changed}) > 1:
-            return False
-    return True
+    return all(len({name in names for name in changed}) <= 1 for names in (BITS, IDENTITY))
 
 
 class Formulas:
@@ -68,7 +65,7 @@ class Formulas:
             self.outside += [self.range(part) for part in idle(node)]
 
     def add_statement(self, node: ast.stmt) -> None:
-        """Remember its lines; of an ``if`` or a loop those of its head. Inner statements come later and prevail."""
+        """Remember its lines; of an ``if`` or a loop those of its head. Inner statements prevail."""
         body = getattr(node, "body", None)
         last = max(node.lineno, body[0].lineno - 1) if body else node.end_lineno or node.lineno
         for line in range(node.lineno, last + 1):
@@ -90,7 +87,11 @@ def idle(node: ast.AST) -> Iterator[ast.AST]:
         if isinstance(part := getattr(node, name, None), ast.expr):
             yield part
     yield from getattr(node, "decorator_list", [])
-    if isinstance(node, (ast.Raise, ast.Assert, ast.Import, ast.ImportFrom, ast.JoinedStr)) or (isinstance(node, ast.If) and not node.orelse and all(isinstance(x, ast.Raise) for x in node.body)) or (isinstance(node, ast.keyword) and node.arg in KEYWORDS):
+    if (
+        isinstance(node, (ast.Raise, ast.Assert, ast.Import, ast.ImportFrom, ast.JoinedStr))
+        or (isinstance(node, ast.If) and not node.orelse and all(isinstance(x, ast.Raise) for x in node.body))
+        or (isinstance(node, ast.keyword) and node.arg in KEYWORDS)
+    ):
         yield node
     elif isinstance(node, ast.Call):
         called = node.func

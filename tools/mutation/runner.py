@@ -2,19 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tests against each mutant, in forks of one process that has imported and collected everything.
 
-``python runner.py JOB`` runs in the copy of the checkout; JOB is a JSON file with what ``main`` reads. Three steps:
+``python runner.py JOB`` runs in the copy of the checkout; JOB is a JSON file with what ``main`` reads. Three
+steps:
 
-1. *The map.* Every test file runs once in a fork under coverage.py, which says for each line which tests execute it.
-   Only tests that pass, and within ``MOST`` seconds, serve. The map is kept for each test file, until it or the
-   package changes.
-2. *A mutant of a line that only runs in tests* is put in place by giving the functions in memory the code of the
-   mutated source; a fork then runs the tests of that line, the quickest and most often successful first, until
-   one fails. Since nothing executed the line before, this is what a fresh import would do.
-3. *A mutant of a line that already runs while modules are imported* (or of a default value) is written to the file
-   and tested in a fork of a process that has imported third-party libraries, pytest among them, but not the package.
+1. *The map.* Every test file runs once in a fork under coverage.py, which says for each line which tests
+   execute it. Only tests that pass, and within ``MOST`` seconds, serve. The map is kept for each test file,
+   until it or the package changes.
+2. *A mutant of a line that only runs in tests* is put in place by giving the functions in memory the code of
+   the mutated source; a fork then runs the tests of that line, the quickest and most often successful first,
+   until one fails. Since nothing executed the line before, this is what a fresh import would do.
+3. *A mutant of a line that already runs while modules are imported* (or of a default value) is written to the
+   file and tested in a fork of a process that has imported third-party libraries, pytest among them, but not
+   the package.
 
-A mutant is caught if a test fails, or if the processor time exceeds ``LONGER`` times that of the map's run. It is
-given up after ``ENOUGH`` seconds (by the map) of tests that pass.
+A mutant is caught if a test fails, or if the processor time exceeds ``LONGER`` times that of the map's run. It
+is given up after ``ENOUGH`` seconds (by the map) of tests that pass.
 """
 
 from __future__ import annotations
@@ -94,7 +96,7 @@ def limited(seconds: float) -> None:
 
 
 def serve_fresh(requests: int, answers: int) -> None:
-    """For each request (a JSON line: file, text, tests, limit) whether its tests pass with that text in the file."""
+    """For each request (JSON: file, text, tests, limit) whether its tests pass with that text in the file."""
     import pytest
 
     with os.fdopen(requests) as lines, os.fdopen(answers, "w") as out:
@@ -145,28 +147,33 @@ class InMemory:
         path = str(Path(file).resolve())
         self.path = path
         self.original = codes(compile(Path(file).read_text(encoding="utf-8"), path, "exec", dont_inherit=True))
-        self.functions: dict[CodeType, list[FunctionType]] = defaultdict(list)
+        self.functions: dict[tuple[Any, ...], list[FunctionType]] = defaultdict(list)
         for thing in gc.get_objects():
             if isinstance(thing, FunctionType) and thing.__code__.co_filename == path:
-                self.functions[thing.__code__].append(thing)
+                self.functions[place(thing.__code__)].append(thing)
 
     def pairs(self, text: str) -> list[tuple[FunctionType, CodeType]] | None:
         """Functions and their new code; ``None`` if more than the code of functions differs."""
         mutated = codes(compile(text, self.path, "exec", dont_inherit=True))
         if len(mutated) != len(self.original):
             return None
-        changed = [(old, new) for old, new in zip(self.original, mutated) if own(old) != own(new)]
-        if not all(old in self.functions or nested(old) for old, _ in changed):
+        changed = [(old, new) for old, new in zip(self.original, mutated, strict=True) if own(old) != own(new)]
+        if not all(place(old) in self.functions or nested(old) for old, _ in changed):
             return None
         # A function whose inner function changed has changed, too: its constants hold the inner code.
         pairs = [
             (function, new)
-            for old, new in zip(self.original, mutated)
+            for old, new in zip(self.original, mutated, strict=True)
             if old != new
-            for function in self.functions.get(old, [])
+            for function in self.functions.get(place(old), [])
         ]
         fits = all(f.__code__.co_freevars == new.co_freevars for f, new in pairs)
         return pairs if pairs and fits else None
+
+
+def place(code: CodeType) -> tuple[Any, ...]:
+    """Where a function stands in its file. (Code that ran is not always equal to the same code that did not.)"""
+    return code.co_qualname, code.co_firstlineno, code.co_linetable
 
 
 def own(code: CodeType) -> tuple[Any, ...]:
@@ -195,20 +202,39 @@ class Runner:
         self.items = {item.nodeid: item for item in session.items}
         self.session = session
         self.map()
-        out = Path(self.job["out"]).open("a", encoding="utf-8")
+        with Path(self.job["out"]).open("a", encoding="utf-8") as out:
+            self.all_tested(out)
+        return True
+
+    def all_tested(self, out: Any) -> None:
+        """A line of JSON for each mutant."""
         gc.collect()
         gc.freeze()
         for file in self.job["files"]:
             memory = InMemory(file)
             self.kills.clear()
-            for line in Path(self.job["mutants"][file]).open(encoding="utf-8"):
+            self.check_clean(file)
+            for line in Path(self.job["mutants"][file]).read_text(encoding="utf-8").splitlines():
                 mutant = json.loads(line)
                 began = time.monotonic()
                 mutant["by"] = self.tested(file, mutant, memory)
                 mutant["seconds"] = round(time.monotonic() - began, 2)
                 del mutant["text"]
                 print(json.dumps({"file": file, **mutant}, ensure_ascii=False), file=out, flush=True)
-        return True
+
+    def check_clean(self, file: str) -> None:
+        """The tests pass with the file as it is, in a fresh import as well: else every mutant would be caught."""
+        text = Path(file).read_text(encoding="utf-8")
+        tests = sorted({t for tests in self.lines[file].values() for t in tests}, key=lambda t: self.seconds[t])
+        if (status := self.fresh(file, text, tests[:200], 600.0)) != 0:
+            raise RuntimeError(f"{file} unchanged: its tests end with status {status}")
+
+    def fresh(self, file: str, text: str, tests: list[str], limit: float) -> int | None:
+        """The exit status of pytest with this text in the file; ``None`` if it takes too long."""
+        request = {"file": file, "text": text, "tests": tests, "limit": limit}
+        print(json.dumps(request), file=self.ask, flush=True)
+        status: int | None = json.loads(self.answer.readline())
+        return status
 
     def map(self) -> None:
         """Fill ``seconds`` (test → processor seconds) and ``lines`` (file → line → tests)."""
@@ -291,6 +317,7 @@ class Runner:
             pairs = memory.pairs(mutant["text"])
         except SyntaxError:
             return "syntax"
+        here = set(known)
         if pairs is None or early:  # values of the import: every test of the room may depend on them
             known |= {t for t in self.seconds if t.startswith(f"test/{room}/")}
 
@@ -299,7 +326,7 @@ class Runner:
             return (self.seconds[test] + away + 0.02) / (1 + self.kills[test])
 
         chosen, together = [], 0.0
-        for test in sorted(known, key=lambda t: (merit(t), t)):
+        for test in sorted(known, key=lambda t: (t not in here, merit(t), t)):
             if together + self.seconds[test] <= ENOUGH:
                 chosen.append(test)
                 together += self.seconds[test]
@@ -307,9 +334,7 @@ class Runner:
             return ""
         limit = LONGER * together + LEAST
         if pairs is None or early:
-            request = {"file": file, "text": mutant["text"], "tests": chosen, "limit": limit}
-            print(json.dumps(request), file=self.ask, flush=True)
-            status = json.loads(self.answer.readline())
+            status = self.fresh(file, mutant["text"], chosen, limit)
             return "time" if status is None else "" if status == 0 else "fresh"
         said, say = os.pipe()
         child = os.fork()
