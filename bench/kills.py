@@ -84,6 +84,8 @@ ROWS = 8
 NOISE = 3e-5 / np.sqrt(40.0)
 """Of a row's point [m]: the mean of the 40 points, each of 0.03 mm, that the identifier averages."""
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+SETTLE = round(0.11 * NANO)
+"""What the identifier leaves out before it averages, and one message [ns]."""
 PATIENCE = 60.0
 """Time in which a node has to be ready, on a busy machine [s]."""
 LAST_WORDS = 0.03
@@ -94,17 +96,17 @@ SAME = 1e-12
 # ── phases of a node's life ──────────────────────────────────────────────────────────────────────────
 
 LATER = {
-    "starting": 0.8,
-    "reading the store": 0.01,
-    "listening": 0.3,
-    "taking a plan": 0.02,
-    "accepting": 0.02,
-    "writing": 0.004,
+    "starting": 0.4,
+    "reading the store": 0.005,
+    "listening": 0.2,
+    "taking a plan": 0.005,
+    "accepting": 0.005,
+    "writing": 0.002,
     "estimating": 0.02,
-    "publishing": 0.002,
-    "undoing": 0.02,
-    "ending": 0.05,
-    "compacting": 0.004,
+    "publishing": 0.0005,
+    "undoing": 0.005,
+    "ending": 0.02,
+    "compacting": 0.001,
 }
 """Phase → longest time from its beginning to the kill [s], about what it lasts; inner phases hide outer ones."""
 PHASES = tuple(LATER)
@@ -121,7 +123,6 @@ SPIED = (
     (identifier.IdentifierNode, "_on_plan", "taking a plan"),
     (identifier.IdentifierNode, "_handle", "accepting"),
     (identifier.IdentifierNode, "_withdraw", "undoing"),
-    (identifier.IdentifierNode, "close", "ending"),
     (identifier.IdentifierOutput, "record", "publishing"),
     (identifier.IdentifierOutput, "estimate", "publishing"),
     (Session, "estimate", "estimating"),
@@ -177,13 +178,18 @@ def spy(marks: Marks) -> None:
 
     for kind, name, phase in SPIED:
         setattr(kind, name, spied(getattr(kind, name), phase))
-    activate = identifier.IdentifierNode.activate
+    activate, close = identifier.IdentifierNode.activate, identifier.IdentifierNode.close
 
     def activated(node: Any) -> None:
         activate(node)
         marks.enter("listening")
 
+    def closed(node: Any) -> bool:
+        marks.enter("ending")
+        return close(node)
+
     setattr(identifier.IdentifierNode, "activate", activated)  # noqa: B010
+    setattr(identifier.IdentifierNode, "close", closed)  # noqa: B010
 
 
 @dataclass(frozen=True)
@@ -205,7 +211,7 @@ class Aim:
 def wait_and_kill(marks: Marks, pid: int, aim: Aim) -> None:
     """What the killing process does."""
     while aim.phase != "starting" and marks.entered(aim.phase) < aim.turn:
-        time.sleep(1e-4)
+        time.sleep(2e-5)
     time.sleep(aim.later)
     os.kill(pid, signal.SIGKILL)
 
@@ -273,7 +279,7 @@ class Heard:
         configurations: How many the newest estimate counts.
         asked: Whether an undo was asked for that nobody has answered.
         shown: (row, first stamp, last stamp) [ns] of every standstill that was shown.
-        stored: (row, first stamp) [ns] of those that the store has, in use or withdrawn.
+        stored: (row, stamp before its rest) [ns] of those that the store has, in use or withdrawn.
         stamp: The newest stamp [ns].
     """
 
@@ -345,8 +351,8 @@ def faults(folder: Path, heard: Heard) -> list[tuple[str, str]]:
                 bad.append(("strange", f"{r.number}, row {r.index}, {r.acquired.start}: shown {shown}"))
     heard.accepted = {n: int(r.index or 0) for n, r in in_use.items()}
     heard.undone, heard.asked, heard.configurations = withdrawn, False, len(in_use)
-    starts = [r.acquired.start for r in kept if r.status in (*KEPT, UNDONE)]
-    heard.stored = [(row, first) for row, first, last in heard.shown if any(first <= s <= last for s in starts)]
+    at_rest = [r for r in kept if r.status in (*KEPT, UNDONE)]
+    heard.stored = [(int(r.index or 0), r.acquired.start - SETTLE) for r in at_rest]
     return bad
 
 
@@ -425,13 +431,13 @@ class Cell:
 
         return self.wait(there, PATIENCE)
 
-    def show(self, row: int, stamp: int) -> int:
-        """A standstill of 0.8 s at a row and the way on; returns the last stamp [ns]."""
+    def show(self, row: int, stamp: int, length: int = 80) -> int:
+        """A standstill of so many points of 100 Hz at a row, and the way on; returns the last stamp [ns]."""
         q, first = self._plan.configurations[row], stamp
-        for i in range(90):
-            stamp += 10**7 if i < 80 else NANO // 5
-            here = q if i < 80 else q + 0.01 * (i - 60)
-            if i == 79:
+        for i in range(length + 10):
+            stamp += 10**7 if i < length else NANO // 5
+            here = q if i < length else q + 0.01 * (20 + i - length)
+            if i == length - 1:
                 self.heard.shown.append((row, first, stamp))
                 self.heard.stamp = max(self.heard.stamp, stamp)
             self._joints.publish(joints_message(self._names, here, stamp))
@@ -441,7 +447,7 @@ class Cell:
         self.heard.stamp = max(self.heard.stamp, stamp)
         return stamp
 
-    def measure(self, row: int) -> bool:
+    def measure(self, row: int, length: int = 80) -> bool:
         """Show a row until it is told accepted; whether it was."""
 
         def told() -> bool:
@@ -449,7 +455,8 @@ class Cell:
             return row in known
 
         for _ in range(5):
-            self.show(row, self.heard.stamp + NANO)
+            # The node may not hear the first messages of its life: what is left is long enough to be averaged.
+            self.show(row, self.heard.stamp + NANO, length)
             if self.wait(told, 20.0):
                 return True
         return False
@@ -579,16 +586,16 @@ def act(cell: Cell, life: Life, rng: random.Random, aim: Aim | None) -> None:
     if not cell.ready():
         life.faults.append(("not restarted", "it is not ready"))
         return
-    if aim is not None and heard.stored and rng.random() < 0.25:
-        life.replayed = True
-        cell.show(*rng.choice(heard.stored))
     missing = [row for row in range(ROWS) if row not in heard.accepted.values()]
     rng.shuffle(missing)
     soon = aim is not None and aim.phase in ("undoing", "ending", "compacting")
-    for row in missing if aim is None else missing[: 1 if soon else rng.randrange(1, 4)]:
-        if not cell.measure(row):
+    for k, row in enumerate(missing if aim is None else missing[: 1 if soon else rng.randrange(1, 4)]):
+        if not cell.measure(row, 80 if k else 240):
             life.faults.append(("lost", f"row {row} is not accepted however often it is shown"))
             return
+        if aim is not None and not k and heard.stored and rng.random() < 0.25:
+            life.replayed = True
+            cell.show(*rng.choice(heard.stored))
     if aim is None:
         cell.wait(lambda: cell.estimate.complete, PATIENCE)
     elif aim.phase == "undoing" or rng.random() < 0.15:
