@@ -70,7 +70,7 @@ from calib_planner.campaign import (
 )
 from calib_planner.errors import CalibPlannerError, FileFormatError, InputError, StoreError
 from calib_planner.io.plan import parse_plan
-from calib_planner.io.text import user_path
+from calib_planner.io.text import settle, user_path
 from calib_planner.io.yaml import Node
 from calib_planner.measurements import Measurements
 from calib_planner.planning import Plan
@@ -375,7 +375,12 @@ class Store:
         last = self._one("SELECT * FROM settings ORDER BY number DESC LIMIT 1")
         if last is None or (last["document"], last["version"]) != (document, version):
             with self._writing() as write:
-                _insert(write, "settings", {"version": version, "document": document, "at": _now()})
+                self._write_settings(write, settings, version)
+
+    @staticmethod
+    def _write_settings(write: sqlite3.Connection, settings: Mapping[str, object], version: str) -> None:
+        document = json.dumps(settings, sort_keys=True, default=list)
+        _insert(write, "settings", {"version": version, "document": document, "at": _now()})
 
 
 class SessionStore(Store):
@@ -741,7 +746,7 @@ def _prepare(database: sqlite3.Connection, path: Path | None, field: str) -> Non
             mark = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {len(MIGRATIONS)};"
             database.executescript(f"BEGIN IMMEDIATE; {''.join(MIGRATIONS[schema:])} {mark} COMMIT;")
             if path is not None:
-                _settle(path.parent)
+                settle(path.parent)
     except sqlite3.OperationalError as error:
         if "locked" in str(error):
             advice = "end the other node or choose another folder"
@@ -752,14 +757,6 @@ def _prepare(database: sqlite3.Connection, path: Path | None, field: str) -> Non
     except sqlite3.DatabaseError as error:
         advice = "move the file away or choose another folder; it was left as it is"
         raise FileFormatError(path, field, error, "a campaign store that is whole", advice) from None
-
-
-def _settle(folder: Path) -> None:
-    """Have the folder know its new file for good."""
-    handle = os.open(folder, os.O_RDONLY)
-    with suppress(OSError):  # not every file system can
-        os.fsync(handle)
-    os.close(handle)
 
 
 def identity(path: Path) -> tuple[int, int] | None:
@@ -1006,7 +1003,7 @@ def begin_campaign(
     try:
         with store._writing() as write:
             store._begin(write, campaign_id)
-        store._note_settings(goals, version)
+            store._write_settings(write, goals, version)
     except BaseException:
         store.close()
         raise

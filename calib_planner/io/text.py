@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -219,6 +220,17 @@ def _replace(target: Path, text: str) -> None:
     except BaseException:
         os.unlink(name)
         raise
+    settle(target.parent)
+
+
+def settle(folder: Path) -> None:
+    """Have a folder know its new names for good: without this a power cut may take back what was renamed or made."""
+    with suppress(OSError):  # not every file system can
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def _mode(target: Path) -> int:

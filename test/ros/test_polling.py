@@ -16,7 +16,7 @@ from calib_planner.acquisition import NANO
 from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
 from calib_planner.ros.messages import nanoseconds, point_message
 from calib_planner.ros.parameters import STREAM_IN
-from calib_planner.ros.rclpy_ext.polling import EVENTS_EVERY, MOST_AT_ONCE, Stream, StreamPoller
+from calib_planner.ros.rclpy_ext.polling import EVENTS_EVERY, MOST_AT_ONCE, Stream, StreamPoller, times_set_back
 
 DEEP = QoSProfile(depth=4000, reliability=ReliabilityPolicy.RELIABLE)
 RELIABLE = {f"qos_overrides./{topic}.subscription.reliability": "reliable" for topic in ("a", "b")}
@@ -74,6 +74,19 @@ def test_what_queued_up_is_handed_out_by_the_stamps(bench: Bench) -> None:
     node.poller.hand_out(fetched)
     wanted = [("b" if i == 1 else "a", (3 * k + i) * NANO) for k in range(50) for i in (1, 2) if (k, i) != (7, 2)]
     assert node.heard == wanted
+
+
+def test_what_came_before_a_clock_was_set_back_comes_first() -> None:
+    day = [NANO * k for k in range(3600, 3700)]
+    before = [s - 3600 * NANO for s in day]
+    assert times_set_back(day) == [0] * 100
+    assert times_set_back([*day, *before, *before]) == [0] * 100 + [1] * 100 + [2] * 100
+    mixed = list(day)
+    mixed[3:5] = mixed[4], mixed[3]
+    late = [*mixed[:50], day[2], day[3], *mixed[50:]]
+    assert times_set_back(late) == [0] * 102  # too few to be sure
+    assert times_set_back(day[::-1]) == [0] * 100  # a clock does not run backwards
+    assert times_set_back([*before[:10], day[0], *before[10:]]) == [0] * 11 + [1] * 90  # one stamp in the future
 
 
 def test_events_have_their_turn(bench: Bench) -> None:

@@ -12,6 +12,9 @@ not wait for them; a timer fetches everything that has come since and sorts it b
 subscriptions (messages lost, qualities of service that do not match) are in that group, too, since every message
 would wake those as well; they may run now and then.
 
+Where a clock was set back meanwhile, or a recording began again, what came before that is handed out first: by the
+stamps alone the end of what was before would come after what is now.
+
 *Upstream.* ros2/rclpy#1223 and #1452 (cost per message). This file may go when an executor of rclpy hands out
 what has queued up in the order of arrival, at a cost per message that is small against the callback's.
 """
@@ -20,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -31,7 +35,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from calib_planner.acquisition import stamp_of
+from calib_planner.acquisition import NANO, stamp_of
 
 PERIOD = 0.01
 """Usual time between two looks at the streams [s]."""
@@ -40,8 +44,13 @@ EVENTS_EVERY = 100
 MOST_AT_ONCE = 1000
 """Messages of one stream that are fetched at a time; the others wait in its queue for the next look."""
 
-Waiting = tuple[int, Any, Callable[[Any], None]]
-"""The stamp of a message [ns], the message, and the callback that takes it."""
+SET_BACK = NANO
+"""Stamps this far behind earlier ones of their stream [ns], and rising, are of a clock that was set back."""
+SURE = 5
+"""So many of them in a row are."""
+
+Waiting = tuple[tuple[int, int], Any, Callable[[Any], None]]
+"""How often the clock had been set back and the stamp of a message [ns]; the message; the callback that takes it."""
 
 
 @dataclass(frozen=True)
@@ -103,14 +112,34 @@ class StreamPoller:
 
     def fetch(self) -> list[Waiting]:
         """What has come, stream by stream."""
-        pairs = zip(self._streams, self._subscriptions, strict=True)
-        return [(stream.stamp(m), m, made.callback) for stream, made in pairs for m in _fetched(made)]
+        waiting: list[Waiting] = []
+        for stream, made in zip(self._streams, self._subscriptions, strict=True):
+            messages = _fetched(made)
+            stamps = [stream.stamp(m) for m in messages]
+            waiting += zip(
+                zip(times_set_back(stamps), stamps, strict=True), messages, [made.callback] * len(stamps)
+            )
+        return waiting
 
     @staticmethod
     def hand_out(waiting: list[Waiting]) -> None:
         """Call back in the order of the stamps."""
         for _, message, callback in sorted(waiting, key=lambda w: w[0]):
             callback(message)
+
+
+def times_set_back(stamps: Sequence[int]) -> list[int]:
+    """For each stamp [ns] of a stream, in the order of arrival: how often its clock had been set back before."""
+    times, newest, result = 0, 0, list[int]()
+    for k, stamp in enumerate(stamps):
+        if stamp < newest - SET_BACK:
+            following = stamps[k : k + SURE]
+            rising = all(a < b for a, b in pairwise((*following, newest - SET_BACK)))
+            if rising and len(following) == SURE:
+                times, newest = times + 1, stamp
+        newest = max(newest, stamp)
+        result.append(times)
+    return result
 
 
 class _Unwoken(CallbackGroup):
