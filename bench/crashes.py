@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is on the disk after a crash at every system call, on a full disk, and after a power cut.
 
-A *program* writes in steps, and acknowledges each: the store of an identifier, the record of a campaign, a journal of
-an earlier version, a file of results. One run without disturbance tells what a reader finds after each step. Then
-the program is run again and again:
+A *program* writes in steps, and acknowledges each: the store of an identifier, the record of a campaign, a
+journal of an earlier version, a file of results. One run without disturbance tells what a reader finds after each
+step. Then the program is run again and again:
 
 * **killed** at each of its system calls that change the folder, in writes after none, one, half or all but one of
   the bytes;
@@ -72,9 +72,16 @@ from calib_planner.io import (
     stored_goals,
     write_text,
 )
-from calib_planner.io.store import CAMPAIGN_FILE, FILE, JOURNAL, JOURNAL_FORMAT
 from calib_planner.planning import PlanQuality
 
+STORE: Any = sys.modules[open_store.__module__]
+"""The module behind the door, for the names of its files."""
+CAMPAIGN_FILE, FILE, JOURNAL, JOURNAL_FORMAT = (
+    STORE.CAMPAIGN_FILE,
+    STORE.FILE,
+    STORE.JOURNAL,
+    STORE.JOURNAL_FORMAT,
+)
 ROBOT = Robot.load("planar_2r")
 MODEL = StoredModel(ROBOT.name, ROBOT.joint_names, 1, "links: [1, 0.7]")
 PROBLEM = CampaignProblem(ROBOT, [0.2, 0.9], 1e-5)
@@ -185,7 +192,7 @@ def session_found(folder: Path) -> Any:
 def campaign_steps(folder: Path) -> list[Step]:
     """A campaign with everything that can happen, a restart in between; then another one takes its place."""
     stops = tuple(PlannedConfiguration(q, FIT if k < 5 else VALIDATION) for k, q in enumerate(Q))
-    known = Round(0, 2, 3, 1e-4, 1e-6, 3e-5, 1e-5)
+    known = Round(0, 3, 2, 1e-4, 1e-6, 3e-5, 4.0, 2, "more")
     events = [
         lambda s: s.decided(NextStep(FIT, "", stops, queue=tuple(range(8)), round=known)),
         lambda s: s.measured(0, Q[0], POINTS[0], 11),

@@ -1,6 +1,6 @@
-/* Copyright 2026 calib_planner contributors
- * SPDX-License-Identifier: Apache-2.0
- *
+/* Copyright 2026 calib_planner contributors */
+/* SPDX-License-Identifier: Apache-2.0 */
+/*
  * Loaded before the C library (LD_PRELOAD): what a program asks of the files in one folder, and of the system's
  * clock, goes through here. system_calls.py compiles it and shares `struct control` with it.
  *

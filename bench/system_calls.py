@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The system as a program sees it, with disks that fill, clocks that are set, and an end at any system call.
 
-``system_calls.c`` is compiled and loaded before the C library (``LD_PRELOAD``). It counts the calls that change the
+``system_calls.c`` is compiled and loaded before the C library (``LD_PRELOAD``). It counts calls that change the
 files of one folder; what shall happen at which call, and how far the clock is ahead, stands in memory that
 processes share, ``Control``. Needs Linux and a C compiler.
 
@@ -117,7 +117,7 @@ def calls(path: Path) -> Iterator[Call]:
 
 
 def forked(work: Any) -> int:
-    """Status of a child that does ``work`` and ends: 0, 1 after an exception, or minus the signal that ended it."""
+    """Status of a child that does ``work`` and ends: 0, 1 after an exception, or minus its signal."""
     if pid := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     status = 1

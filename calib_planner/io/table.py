@@ -288,6 +288,8 @@ class _Sniffer:
         doubled = sorted(n for n, count in Counter(names).items() if count > 1 and n not in ("", "-"))
         if doubled:
             raise FileFormatError(self.path, "header", f"{listed(doubled)} twice", "each column name once")
+        if self.separator == WHITE and units:
+            units = self._below_names(units, names, self.lines[begin - 1][0])
         rows, numbers = self._body(begin, len(names))
         return Table(
             path=self.path,
@@ -369,6 +371,19 @@ class _Sniffer:
             where, valid = f"{self.raw.word} {number}", "a row of numbers, or of units below the header"
             raise FileFormatError(self.path, where, brief(text, 40), valid, "remove the line")
         return above[at], units, at
+
+    def _below_names(self, units: tuple[str, ...], names: list[str], number: int) -> tuple[str, ...]:
+        """Units, one for each name: between white space nobody sees which column has none."""
+        if not names[0] and len(units) == len(names) - 1:
+            return ("", *units)
+        if len(units) != len(names):
+            got, valid = (
+                f"{counted(len(units), 'unit')} for {counted(len(names), 'column')}",
+                "one for each column",
+            )
+            advice = "write - where there is none, or use another separator"
+            raise FileFormatError(self.path, f"{self.raw.word} {number}", got, valid, advice)
+        return units
 
     def _may_be_names(self, text: str, width: int) -> bool:
         """Whether a line without any known name may be a header rather than a title."""

@@ -224,7 +224,7 @@ def _replace(target: Path, text: str) -> None:
 
 
 def settle(folder: Path) -> None:
-    """Have a folder know its new names for good: without this a power cut may take back what was renamed or made."""
+    """Have a folder know its new names for good: else a power cut may take back what was renamed or made."""
     with suppress(OSError):  # not every file system can
         handle = os.open(folder, os.O_RDONLY)
         try:

@@ -85,7 +85,8 @@ def any_layout(draw: st.DrawFn) -> Layout:
         quoted=quoted,
         trailing=mark != " " and draw(st.booleans()),
         order=draw(st.sampled_from(["", "points", "mixed"])) if header else "",
-        more=("temperature",) if header and draw(st.booleans()) else (),
+        # between white space a column without a unit cannot be told in a row of units, which is refused
+        more=("temperature",) if header and (mark, written) != (" ", "row") and draw(st.booleans()) else (),
         std=header and draw(st.booleans()),
         stated={} if written else {"units": f"{length},{angle}"},
     )
@@ -196,6 +197,11 @@ REFUSED: dict[str, tuple[str | bytes, dict, list[str]]] = {
         (HEAD + ROW * 3 + ROW[:4] + ROW[8:]).replace(",", " "),
         {},
         ["line 5", "8 cells", "another separator"],
+    ),
+    "fewer units than columns in white space": (
+        (HEAD[:-1] + ",temperature\n" + "rad," * 6 + "m,m,m\n" + (ROW[:-1] + ",21\n") * 3).replace(",", " "),
+        {},
+        ["line 2", "9 units for 10 columns", "write - where there is none"],
     ),
     "strange sep": ("sep=#\n" + HEAD + ROW, {}, ["first line", "sep=#", "semicolon"]),
     "comments only": ("# nothing\n", {}, ["comments only"]),

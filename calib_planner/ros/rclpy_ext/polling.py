@@ -12,7 +12,7 @@ not wait for them; a timer fetches everything that has come since and sorts it b
 subscriptions (messages lost, qualities of service that do not match) are in that group, too, since every message
 would wake those as well; they may run now and then.
 
-Where a clock was set back meanwhile, or a recording began again, what came before that is handed out first: by the
+Where a clock was set back meanwhile, or a recording began again, what came before is handed out first: by the
 stamps alone the end of what was before would come after what is now.
 
 *Upstream.* ros2/rclpy#1223 and #1452 (cost per message). This file may go when an executor of rclpy hands out
@@ -50,7 +50,7 @@ SURE = 5
 """So many of them in a row are."""
 
 Waiting = tuple[tuple[int, int], Any, Callable[[Any], None]]
-"""How often the clock had been set back and the stamp of a message [ns]; the message; the callback that takes it."""
+"""How often the clock was set back, and the stamp of a message [ns]; the message; the callback that takes it."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,8 @@ class StreamPoller:
         for stream, made in zip(self._streams, self._subscriptions, strict=True):
             messages = _fetched(made)
             stamps = [stream.stamp(m) for m in messages]
-            waiting += zip(
-                zip(times_set_back(stamps), stamps, strict=True), messages, [made.callback] * len(stamps)
-            )
+            order = zip(times_set_back(stamps), stamps, strict=True)
+            waiting += [(place, m, made.callback) for place, m in zip(order, messages, strict=True)]
         return waiting
 
     @staticmethod
