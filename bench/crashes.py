@@ -241,7 +241,8 @@ def campaign_found(folder: Path) -> Any:
     aside = []
     for path in sorted(folder.glob(f"before_*_{CAMPAIGN_FILE}")):
         with tempfile.TemporaryDirectory(prefix="aside_") as copied:
-            shutil.copy(path, Path(copied) / CAMPAIGN_FILE)
+            for part in folder.glob(f"{path.name}*"):  # what could not be taken over stands in a file beside
+                shutil.copy(part, Path(copied) / part.name.replace(path.name, CAMPAIGN_FILE))
             aside.append(one_campaign(Path(copied)))
     return one_campaign(folder), aside
 

@@ -50,6 +50,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -989,15 +990,7 @@ def begin_campaign(
     """
     path = user_path(folder) / CAMPAIGN_FILE
     with _disk(path, WRITABLE):
-        if path.exists():
-            try:
-                connect(path, field).close()
-            except FileFormatError:  # what is damaged or foreign is kept as well
-                if path.is_symlink():
-                    raise
-        for name in (CAMPAIGN_FILE, f"{CAMPAIGN_FILE}-wal", JOURNAL):
-            if path.with_name(name).exists():
-                path.with_name(name).rename(path.with_name(f"before_{campaign_id}_{name}"))
+        _set_aside(path, campaign_id, field)
     store = CampaignStore(path, connect(path, field), _model(robot))
     try:
         with store._writing() as write:
@@ -1007,6 +1000,44 @@ def begin_campaign(
         store.close()
         raise
     return store
+
+
+USED = """
+SELECT (SELECT COUNT(*) FROM campaigns WHERE plan_id != ?) + (SELECT COUNT(*) FROM standstills)
+     + (SELECT COUNT(*) FROM events)
+"""
+"""How many campaigns but one, and things that happened, are in a record."""
+
+
+def _set_aside(path: Path, campaign_id: str, field: str) -> None:
+    """Keep a record and a journal that are there beside, under names that no file has.
+
+    A record stays, and the campaign begins in it, if none began there, or only this one and nothing happened;
+    a full disk leaves such a record.
+    """
+    folder, fresh = path.parent, False
+    if path.exists():
+        try:
+            database = connect(path, field)
+            try:
+                fresh = not database.execute(USED, (campaign_id,)).fetchone()[0]
+            finally:
+                database.close()
+        except (FileFormatError, sqlite3.DatabaseError):  # what is damaged or foreign is kept as well
+            if path.is_symlink():
+                raise
+    parts = [JOURNAL] if fresh else [CAMPAIGN_FILE, f"{CAMPAIGN_FILE}-wal", JOURNAL]
+    names = [name for name in parts if path.with_name(name).exists()]
+    pairs: list[tuple[Path, Path]] = []
+    for k in count():
+        prefix = f"before_{campaign_id}_{k}" if k else f"before_{campaign_id}"
+        pairs = [(path.with_name(name), path.with_name(f"{prefix}_{name}")) for name in names]
+        if not any(aside.exists() for _, aside in pairs):
+            break
+    for path, aside in pairs:
+        path.rename(aside)
+    if pairs:
+        settle(folder)
 
 
 def open_campaign(folder: str | Path, robot: Robot, field: str = "store_folder") -> StoredCampaign | None:
@@ -1037,7 +1068,8 @@ def open_campaign(folder: str | Path, robot: Robot, field: str = "store_folder")
     except BaseException:
         store.close()
         if new:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
         raise
 
 
