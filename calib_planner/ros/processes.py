@@ -23,11 +23,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.ros import nodes as nodes_folder
@@ -104,10 +105,11 @@ class Nodes:
     Args:
         folder: The folder for a log per node.
         domain: ROS domain id.
+        popen: Starts a process, as ``subprocess.Popen`` does.
     """
 
-    def __init__(self, folder: Path, domain: int) -> None:
-        self._folder, self._children = folder, list[_Child]()
+    def __init__(self, folder: Path, domain: int, popen: Callable[..., Any] = subprocess.Popen) -> None:
+        self._folder, self._children, self._popen = folder, list[_Child](), popen
         self._environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -123,7 +125,7 @@ class Nodes:
         self._folder.mkdir(parents=True, exist_ok=True)
         log = self._folder / f"{module}.log"
         with log.open("wb") as sink:
-            process = subprocess.Popen(
+            process = self._popen(
                 command,
                 stdin=subprocess.PIPE,  # closed by the system when this process ends, however it does
                 stdout=sink,

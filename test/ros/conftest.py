@@ -21,6 +21,12 @@ else:
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
     sys.path.insert(0, str(Path(__file__).parent))
     from bench import Bench
+    from warm_processes import Warm
+
+    @pytest.fixture(scope="session")
+    def warm() -> Iterator[Warm]:
+        with Warm() as made:
+            yield made
 
     @pytest.fixture
     def bench() -> Iterator[Bench]:

@@ -20,6 +20,7 @@ from desk import ASKED, NAME, Desk, S
 from fake_cell import FakeCell
 from geometry_msgs.msg import Point
 from rclpy.parameter import Parameter
+from warm_processes import Forked, Warm
 
 from calib_planner import Robot
 from calib_planner.io import open_campaign, read_data, read_estimate
@@ -120,25 +121,25 @@ def test_measurements_of_a_validation_that_join_the_fit_are_in_the_last_plan_of_
     assert "-validation-" in names[joined - 1] and any("-validation-" in n for n in names[joined + 1 :])
 
 
-def simulator_process(folder: Path, domain: int) -> subprocess.Popen[bytes]:
+def simulator_process(warm: Warm, folder: Path, domain: int) -> Forked:
     command = [sys.executable, "-m", "calib_planner.ros.nodes.simulator", "--ros-args"]
     for name, value in SIMULATOR.items():
         command += ["-p", f"{name}:={value}"]
     environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with (folder / "simulator.log").open("ab") as log:
-        return subprocess.Popen(command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+        return warm.popen(command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
 
 
-def test_a_robot_killed_on_the_way_is_waited_for(bench: Bench, tmp_path: Path) -> None:
+def test_a_robot_killed_on_the_way_is_waited_for(bench: Bench, warm: Warm, tmp_path: Path) -> None:
     bench.start(IdentifierNode, **IDENTIFIER)
     desk = Desk(bench, silence=1.5)
-    processes = [simulator_process(tmp_path, bench.domain)]
+    processes = [simulator_process(warm, tmp_path, bench.domain)]
     try:
         assert desk.call("start")[0]
         desk.until(S.MEASURING, 60.0, measured=3)
         processes[0].kill()
         assert desk.until(S.WAITING, 60.0, said="execute_plan").measured >= 3
-        processes.append(simulator_process(tmp_path, bench.domain))
+        processes.append(simulator_process(warm, tmp_path, bench.domain))
         done = desk.until(S.DONE, 120.0)
         assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
     finally:

@@ -13,6 +13,7 @@ from bench import Bench
 from desk import ASKED, Desk, S
 from fake_cell import FakeCell
 from robots import repeats
+from warm_processes import Warm
 
 from calib_planner import Robot
 from calib_planner.io import open_campaign
@@ -24,13 +25,13 @@ NODE = "campaign_node"
 class Restarts:
     """The node, again and again, over one store; each time it ends with status 0 and no traceback."""
 
-    def __init__(self, bench: Bench, folder: Path) -> None:
-        self.bench, self.folder, self.number = bench, folder, 0
+    def __init__(self, bench: Bench, folder: Path, warm: Warm) -> None:
+        self.bench, self.folder, self.number, self.warm = bench, folder, 0, warm
         self.nodes: Nodes | None = None
 
     def start(self, **parameters: object) -> None:
         self.number += 1
-        self.nodes = Nodes(self.folder / str(self.number), self.bench.domain)
+        self.nodes = Nodes(self.folder / str(self.number), self.bench.domain, self.warm.popen)
         self.nodes.start(NODE, ASKED | {"store_folder": str(self.folder / "store")} | parameters)
         self.bench.wait(lambda: "call ~/" in self.log, 60.0)
 
@@ -52,8 +53,8 @@ class Restarts:
 
 
 @pytest.fixture
-def runs(bench: Bench, tmp_path: Path) -> Iterator[Restarts]:
-    made = Restarts(bench, tmp_path)
+def runs(bench: Bench, tmp_path: Path, warm: Warm) -> Iterator[Restarts]:
+    made = Restarts(bench, tmp_path, warm)
     yield made
     if made.nodes is not None:
         made.nodes.end(signal.SIGKILL)

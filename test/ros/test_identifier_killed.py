@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import random
-import subprocess
 import sys
 import time
 from functools import partial
@@ -21,6 +20,7 @@ from geometry_msgs.msg import PointStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from robots import plan_of, random_configurations, repeats
 from sensor_msgs.msg import JointState
+from warm_processes import Forked, Warm
 
 from calib_planner import Robot
 from calib_planner.acquisition import NANO
@@ -99,14 +99,14 @@ class Feeder:
         raise AssertionError(f"row {row} was not accepted: {self.measurements[-1:]}")
 
 
-def started(folder: Path, log: Path, domain: int) -> subprocess.Popen[bytes]:
+def started(warm: Warm, folder: Path, log: Path, domain: int) -> Forked:
     command = [sys.executable, "-m", "calib_planner.ros.nodes.identifier", "--ros-args"]
     for topic in ("joint_states", "tracker/point"):
         command += ["-p", f"qos_overrides./{topic}.subscription.reliability:=reliable"]
     command += ["-p", "robot:=planar_2r", "-p", f"store_folder:={folder}"]
     environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
     with log.open("ab") as sink:
-        return subprocess.Popen(command, stdout=sink, stderr=sink, env=environment)
+        return warm.popen(command, stdout=sink, stderr=sink, env=environment)
 
 
 def stored(folder: Path) -> list[int | None]:
@@ -123,7 +123,7 @@ def stored(folder: Path) -> list[int | None]:
 
 
 @pytest.mark.timeout(300)
-def test_a_node_killed_while_it_is_fed_goes_on(tmp_path: Path) -> None:
+def test_a_node_killed_while_it_is_fed_goes_on(warm: Warm, tmp_path: Path) -> None:
     rng, log, stamp = random.Random(2), tmp_path / "log", 1000 * NANO
     finals = []
     for name, kills in (("undisturbed", 0), ("killed", repeats(1, 3))):
@@ -131,7 +131,7 @@ def test_a_node_killed_while_it_is_fed_goes_on(tmp_path: Path) -> None:
         for k in range(kills + 1):
             rows = stored(tmp_path / name)
             assert rows == list(range(len(rows))) and len(rows) >= done, "told and lost"
-            with Bench() as bench, started(tmp_path / name, log, bench.domain) as process:
+            with Bench() as bench, started(warm, tmp_path / name, log, bench.domain) as process:
                 feeder = Feeder(bench, stamp)
                 try:
                     bench.wait(lambda f=feeder: f.matched, 60.0)  # type: ignore[misc]

@@ -19,6 +19,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from robots import repeats
+from warm_processes import Warm
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.ros import processes
@@ -39,6 +40,10 @@ with own_domain() as domain:
 """
 
 
+NOT_OF_THE_DEMO = ("campaign_node", "executor_node", "page_node")
+"""Started here in processes of their own, by an interpreter that has imported nothing; the others by the demo."""
+
+
 def running(pid: int) -> bool:
     """Whether a process is at work; one that only waits to be collected is not."""
     try:
@@ -56,7 +61,7 @@ def wait(condition: Callable[[], bool], seconds: float = 40.0) -> bool:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes by /proc")
 def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
-    names = repeats(node_names()[:2], node_names())
+    names = repeats(NOT_OF_THE_DEMO, node_names())
     command = [sys.executable, "-c", PARENT, str(tmp_path), *names]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
@@ -76,8 +81,8 @@ def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", repeats([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
-def test_every_node_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
-    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+def test_every_node_ends_with_status_0(warm: Warm, tmp_path: Path, number: signal.Signals) -> None:
+    with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         for name in node_names():
             nodes.start(name)
         logs = [tmp_path / f"{name}.log" for name in node_names()]
@@ -118,11 +123,11 @@ def test_ctrl_c_while_modules_are_imported_ends_a_node_without_a_word(name: str,
 
 
 @pytest.mark.parametrize("seed", repeats(range(1), range(10)))
-def test_ctrl_c_several_times_ends_all_nodes_with_status_0(tmp_path: Path, seed: int) -> None:
+def test_ctrl_c_several_times_ends_all_nodes_with_status_0(warm: Warm, tmp_path: Path, seed: int) -> None:
     """A terminal tells all of its processes, ``ros2 launch`` tells them again, and people do."""
     draw = np.random.default_rng(seed)
     names = node_names()
-    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+    with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         for name in names:
             nodes.start(name)
         logs = {name: tmp_path / f"{name}.log" for name in names}
@@ -144,8 +149,8 @@ def test_ctrl_c_several_times_ends_all_nodes_with_status_0(tmp_path: Path, seed:
         assert not [line for line in wrong if "control_msgs is not installed" not in line], lines
 
 
-def test_one_node_ends_and_is_started_again(tmp_path: Path) -> None:
-    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+def test_one_node_ends_and_is_started_again(warm: Warm, tmp_path: Path) -> None:
+    with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         log = tmp_path / "simulator_node.log"
         for _ in range(2):
             nodes.start("simulator_node")

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from calib_planner_msgs.msg import CalibrationEstimate, PlanRequest
 from calib_planner_msgs.srv import PlanCalibration
 from poses import poses
 from robots import repeats
+from warm_processes import Warm
 
 from calib_planner import Robot
 from calib_planner.ros import demo
@@ -28,8 +30,8 @@ from calib_planner.simulation import random_deviations
 SEED = 11
 
 
-def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
-    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+def test_plan_measure_identify_agree_with_the_truth(warm: Warm, tmp_path: Path) -> None:
+    with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         nodes.start("planner_node", {"starts": 16})
         nodes.start("identifier_node", {"save_folder": f"'{tmp_path}'"})
         exact = {"error_model": "paper"}  # nothing but parameters and noise, which the estimate is held to
@@ -66,8 +68,10 @@ def test_plan_measure_identify_agree_with_the_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", repeats([signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]))
-def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: signal.Signals) -> None:
-    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+def test_a_planner_that_is_planning_ends_with_status_0(
+    warm: Warm, tmp_path: Path, number: signal.Signals
+) -> None:
+    with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         nodes.start("planner_node", {"starts": 5000})
         client = DemoClient(domain, nodes.check)
         try:
@@ -90,8 +94,8 @@ def test_a_planner_that_is_planning_ends_with_status_0(tmp_path: Path, number: s
         assert "Traceback" not in nodes.logs()["planner_node"]
 
 
-def test_a_node_that_fails_is_reported(tmp_path: Path) -> None:
-    with own_domain() as domain, Nodes(tmp_path, domain) as nodes:
+def test_a_node_that_fails_is_reported(warm: Warm, tmp_path: Path) -> None:
+    with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         nodes.start("planner_node", {"robt": "planar_2r"})
         client = DemoClient(domain, nodes.check)
         try:
@@ -110,8 +114,9 @@ def test_wrong_use_of_the_demo(option: list[str], capsys: pytest.CaptureFixture[
 
 
 def test_a_demo_that_cannot_be_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    warm: Warm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(demo, "Nodes", partial(Nodes, popen=warm.popen))
     monkeypatch.setattr(demo, "LEVEL", "no_such_level")  # the planner refuses the request
     assert demo.main(["--configurations", "3", "--json", "--output", str(tmp_path)]) == 1
     shown = capsys.readouterr()
