@@ -22,6 +22,7 @@ components, a short and a long ℓ, add their variances to the same coefficients
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -125,12 +126,16 @@ class JointFunctions:
         return np.tile(per_order, 2 * len(robot.joint_names))
 
 
+@lru_cache(256)  # a fit wants the same lengths again and again, and Bessel functions take a tenth of its time
 def spectrum(length: float, harmonics: int) -> tuple[FloatArray, FloatArray]:
-    """(harmonics,) λ_n, of sum one, and dλ_n/d log ℓ, for the length ℓ [rad]."""
+    """(harmonics,) λ_n, of sum one, and dλ_n/d log ℓ, for the length ℓ [rad]; not to be written to."""
     kappa = 1.0 / length**2
     bessel = ive(np.arange(harmonics + 2), kappa)
     share = bessel[1:-1]
     by_kappa = 0.5 * (bessel[:-2] + bessel[2:]) - share  # of exp(−κ) I_n(κ)
     total = share.sum()
     gradient = (by_kappa - share * by_kappa.sum() / total) / total
-    return share / total, -2.0 * kappa * gradient
+    spectra = share / total, -2.0 * kappa * gradient
+    for values in spectra:
+        values.flags.writeable = False
+    return spectra
