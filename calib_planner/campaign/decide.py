@@ -100,7 +100,7 @@ def next_batch(state: CampaignState, known: Assessment | None, stopped: Callable
     allowed = problem.fit_budget - state.spent(FIT)
     request = plan_problem(state, known)
     size, repeated = _size(state, known, request, allowed)
-    made = plan(replace(request, configurations=size), lambda progress: stopped())
+    made = plan(replace(request, configurations=size), lambda progress: stopped(), bounded=False)
     q = made.configurations
     first = len(state.configurations)
     queue = toured(state, q, tuple(range(first, first + len(q))))

@@ -93,6 +93,7 @@ def plan(
     executor: Executor | None = None,
     *,
     prove: bool = False,
+    bounded: bool = True,
 ) -> Plan:
     """Find the best configurations, and a bound on how good any could be.
 
@@ -102,6 +103,7 @@ def plan(
         executor: Any ``concurrent.futures`` executor; the plan is the same whichever, or without one. With
             one, time limit and cancellation act between the parts of the work.
         prove: Make the bound rigorous (see ``prove``); the message says how close and, if not, why.
+        bounded: Whether a bound is wanted, which takes time; without one the plan says none, and none is proved.
 
     Raises:
         InfeasibleError: Nothing satisfies the problem; names what stands in the way.
@@ -114,7 +116,7 @@ def plan(
     gap = CLOSELY if prove else GAP  # a required proof is worth a design that is near its own bound
     design = _approximate(space, target, rng, clock.over, executor, gap) if target.concave else None
     proof = None
-    if design is not None:
+    if design is not None and bounded:
         design, proof = _proven(space, target, design, np.random.default_rng(own.spawn(1)[0]), clock, prove)
     clock.tell(bound=design.bound if design else None)
     best, rounded = None, _Rounded(space, criterion, design)
@@ -122,7 +124,7 @@ def plan(
         result, best = _choose(space, criterion, target, design, rng, clock)
     else:
         result = _search(space, criterion, design, seeds, rounded, clock, executor)
-    return _assemble(space, target, design, proof, best, rounded, result, clock)
+    return _assemble(space, target, design if bounded else None, proof, best, rounded, result, clock)
 
 
 @one_thread

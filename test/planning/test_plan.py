@@ -59,6 +59,14 @@ def test_same_seed_same_plan():
     assert not np.array_equal(first.configurations, other.configurations)
 
 
+def test_without_a_bound_the_plan_is_as_good_and_says_none():
+    problem = PlanProblem(kuka(), TEST_POSE, 6, search=Search(starts=8))
+    bounded, without = plan(problem), plan(problem, bounded=False)
+    assert not np.isfinite(without.quality.lower_bound) and not np.isfinite(without.quality.efficiency)
+    assert without.quality.predicted_accuracy <= 1.01 * bounded.quality.predicted_accuracy
+    assert without.quality.predicted_accuracy >= bounded.quality.lower_bound
+
+
 def test_progress_and_cancel_return_a_valid_plan():
     seen = []
 
