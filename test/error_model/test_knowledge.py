@@ -23,7 +23,7 @@ from calib_planner.error_model import (
     Prior,
     typical,
 )
-from calib_planner.error_model.knowledge import Knowledge, prior_information
+from calib_planner.error_model.knowledge import Knowledge, error_variance, prior_information
 from calib_planner.error_model.knowledge import information as information_of
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.tracker import Isotropic, LaserTracker
@@ -214,3 +214,107 @@ def test_gravity_where_it_was_not_learnt_is_uncertain() -> None:
     loaded = [k.accuracy(test, payload=5.0).value for k in (unloaded, mixed_loads)]
     assert loaded[1] < 0.5 * loaded[0]
     assert unloaded.accuracy(test, payload=0.0).value < loaded[0]
+
+
+def test_what_the_joints_read_is_the_inverse_of_where_they_stand() -> None:
+    robot = kr270("full", ("base", "tool"))
+    known = Knowledge.of_plan(robot, slim(), poses_of(robot, 20, 5))
+    own = len(robot.parameter_names)
+    drawn = np.random.default_rng(0).normal(0.0, 1e-3, len(known.coefficients))
+    bent = replace(known, coefficients=np.where(np.arange(len(drawn)) < own, 0.0, drawn))
+    wanted = poses_of(robot, 5, 6)
+    q = bent.reading(wanted)
+    assert np.abs(q - wanted).max() > 1e-4
+    np.testing.assert_allclose(bent.actual(q), wanted, rtol=0.0, atol=2e-15)
+    assert bent.reading(wanted[:0]).shape == (0, 6)
+
+
+def test_a_payload_of_thrice_the_mass_bends_thrice_as_much_and_as_uncertainly() -> None:
+    robot = kr270("d1,q2")
+    model = replace(slim(), gravity=Gravity((Mass("arm"),), payload=Payload(5.0)))
+    names, rng = model.names(robot), np.random.default_rng(0)
+    half, hidden = rng.standard_normal((len(names), len(names))), rng.standard_normal((len(names), 2))
+    known = Knowledge(robot, model, rng.standard_normal(len(names)), half @ half.T, hidden)
+    heavy = known.carrying(Payload(15.0))
+    factor = np.array([3.0 if name.startswith("gravity.payload.") else 1.0 for name in names])
+    assert 1 < np.sum(factor > 1.0) < len(names) and heavy.model.names(robot) == names
+    np.testing.assert_allclose(heavy.coefficients, factor * known.coefficients, rtol=1e-12)
+    np.testing.assert_allclose(heavy.covariance, np.outer(factor, factor) * known.covariance, rtol=1e-12)
+    np.testing.assert_allclose(heavy.hidden, factor[:, None] * hidden, rtol=1e-12)
+    none = known.carrying(None)
+    stays = [names.index(name) for name in none.model.names(robot)]
+    assert len(stays) == np.sum(factor == 1.0)
+    np.testing.assert_array_equal(none.coefficients, known.coefficients[stays])
+    np.testing.assert_array_equal(none.hidden, hidden[stays])
+    assert none.carrying(None) is none
+
+
+def test_of_new_targets_nothing_is_known_and_of_the_rest_all_that_was() -> None:
+    robot = kr270("d1,q2", ("base", "tool"))
+    model = slim()
+    names, rng = model.names(robot), np.random.default_rng(0)
+    half, hidden = rng.standard_normal((len(names), len(names))), rng.standard_normal((len(names), 2))
+    known = Knowledge(robot, model, rng.standard_normal(len(names)), half @ half.T, hidden)
+    two = known.with_new_targets([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    there = [names.index(name) for name in names if not name.startswith("target_")]
+    after = list(two.model.names(two.robot))
+    new = [f"target_{t}.{axis}" for t in (1, 2) for axis in "xyz"]
+    assert sorted(after) == sorted([names[i] for i in there] + new)
+    at, fresh = [after.index(names[i]) for i in there], [after.index(name) for name in new]
+    np.testing.assert_array_equal(two.coefficients[at], known.coefficients[there])
+    np.testing.assert_array_equal(two.covariance[np.ix_(at, at)], known.covariance[np.ix_(there, there)])
+    np.testing.assert_array_equal(two.hidden[at], hidden[there])
+    np.testing.assert_array_equal(two.covariance[fresh][:, at], 0.0)
+    np.testing.assert_array_equal(two.covariance[np.ix_(fresh, fresh)], np.eye(6))  # a metre each way
+    assert not two.coefficients[fresh].any() and not two.hidden[fresh].any()
+
+
+def test_a_hidden_direction_is_felt_by_its_share_of_what_moves_most_in_any_unit() -> None:
+    hidden, inverse = np.array([[0.0], [1.0]]), np.diag([4.0, 0.0])
+    for unit in (1e-3, 1.0, 1e3):
+        for share, felt in ((0.5e-6, False), (2e-6, True)):
+            rows = unit * np.array([[1.0, 0.0], [0.5, share], [0.0, -share], [0.0, 0.0], [0.25, 0.0], [0.0, 0.0]])
+            expected = np.inf if felt else unit**2 * 4.0 * (1.0 + 0.25 + 0.0625) / 2
+            assert error_variance(rows, inverse, hidden) == pytest.approx(expected)
+
+
+def test_a_test_pose_without_weight_does_not_count_even_if_nothing_is_known_there() -> None:
+    robot = kr270("d2,q2", ("base",))
+    one = Knowledge.of_plan(robot, ErrorModel.paper(SIGMA), np.tile(TEST, (2, 1)))
+    both = one.accuracy([TEST, TEST + 0.3], weights=[2.0, 0.0])
+    assert np.isinf(both.per_pose[1])
+    assert both.value == pytest.approx(both.per_pose[0])
+
+
+@pytest.mark.parametrize("excess", [0.0, 3e-13])
+def test_parameters_alone_if_the_others_cannot_be_told_apart(excess: float) -> None:
+    """Three coefficients of one value: they tell what one does, also if rounding makes them more than alike."""
+    robot = kr270("d2")
+    names = slim().names(robot)
+    covariance = np.zeros((len(names), len(names)))
+    covariance[0, 0], covariance[1:4, 1:4] = 1.0, 4.0
+    covariance[1:4, 1:4] += 4.0 * excess * (1.0 - np.eye(3))
+    covariance[0, 1:4] = covariance[1:4, 0] = 1.2 + np.array([1e-7, -1e-7, 0.0]) * (excess > 0.0)
+    known = Knowledge(robot, slim(), np.zeros(len(names)), covariance, np.zeros((len(names), 0)))
+    assert known._parameters_alone == pytest.approx(np.array([[1.0 - 1.2**2 / 4.0]]), rel=1e-6)
+
+
+def test_points_that_were_not_seen_tell_nothing() -> None:
+    """As if those coordinates had not been measured; the mean comes from the conditional normal distribution."""
+    robot = Robot.load("ur10e").with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05]])
+    model, q = slim().with_values({"shared": 2e-5}), poses_of(robot, 15, 0)
+    known = Knowledge.of_plan(robot, model, q[:13])
+    seen, points = np.array([[True, False], [True, True]]), robot.positions(q[13:]).copy()
+    points += 1e-5 * np.random.default_rng(0).standard_normal(points.shape)
+    points[~seen] = np.nan
+    told = known.updated(q[13:], points, seen, rounds=1)
+    poses, use = known.poses(q[13:]), np.repeat(seen, 3, axis=1).ravel()
+    rows = model.columns(poses).reshape(12, -1)[use]
+    noise, each = np.zeros((12, 12)), model.visit_covariance(poses)
+    noise[:6, :6], noise[6:, 6:] = each
+    gain = known.covariance @ rows.T @ np.linalg.inv(rows @ known.covariance @ rows.T + noise[np.ix_(use, use)])
+    expected = gain @ (points - poses.points).ravel()[use]
+    scale = np.sqrt(np.maximum(np.diag(known.covariance), 0.0)) + 1e-300
+    np.testing.assert_allclose(told.coefficients / scale, expected / scale, atol=1e-6)
+    fewer = (known.covariance - gain @ rows @ known.covariance) / np.outer(scale, scale)
+    np.testing.assert_allclose(told.covariance / np.outer(scale, scale), fewer, atol=1e-6)

@@ -19,6 +19,7 @@ from calib_planner.identification.left_out import left_out
 from calib_planner.identification.likelihood import (
     LinearProblem,
     Solution,
+    _moved,
     by_coefficients,
     dense,
     derivatives,
@@ -153,6 +154,50 @@ def test_what_uncertain_scales_add_is_the_slope_of_the_estimate(
     added = with_uncertain_scales(solution, (names, covariance)) - solution.posterior()
     expected = gradient @ covariance @ gradient.T
     np.testing.assert_allclose(added, expected, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("form", [dense, by_coefficients])
+def test_the_covariance_of_the_scales_is_twice_the_inverse_of_the_average_information(
+    form: Callable[[LinearProblem], Solution],
+) -> None:
+    """f_aᵀ P f_b of Gilmour, Thompson & Cullis with P of all contrasts, f_a by differences of the whole V."""
+    problem = problem_of(10, 2)
+    names, covariance = scale_covariance(form(problem))
+    flat, y = problem.flat_columns, problem.y.ravel()
+    basis = np.linalg.qr(np.hstack([flat, np.eye(len(flat))]))[0][:, flat.shape[1] :]
+    projection = basis @ np.linalg.inv(basis.T @ total_covariance(problem) @ basis) @ basis.T
+    pushes = []
+    for name in names:
+        model, step = problem.model, 1e-4
+        sides = [
+            total_covariance(problem.at(model.with_values({name: model.values[name] * np.exp(s)})))
+            for s in (step, -step)
+        ]
+        pushes.append((sides[0] - sides[1]) @ projection @ y / (2 * step))
+    factors = np.array([s.factor for s in problem.model.scales if s.name in names])
+    information = np.array(pushes) @ projection @ np.transpose(pushes) + np.diag(2.0 / np.log(factors) ** 2)
+    np.testing.assert_allclose(np.linalg.inv(covariance), 0.5 * information, atol=1e-5 * information.max())
+
+
+def test_flat_columns_that_no_point_shows_have_no_part_in_the_basis() -> None:
+    problem = problem_of(9, 2, missing=tuple((visit, 1) for visit in range(9)))
+    rows = problem.columns[:, :, problem.flat].reshape(problem.y.size, -1)
+    unseen = ~rows.any(axis=0)
+    assert unseen.sum() == 3 and not problem.basis[unseen].any()
+    np.testing.assert_allclose(
+        problem.flat_columns.T @ problem.flat_columns, np.eye(rows.shape[1] - 3), atol=1e-7
+    )
+
+
+def test_a_scale_stays_within_its_bounds() -> None:
+    """Between 0.005 and 300 times its median; a thousand million times where nothing is known of it."""
+    model = replace(ErrorModel.paper(), scales=(replace(ErrorModel.paper().scales[0], value=2e-5, median=1e-4),))
+    for step, share in ((np.log(3.0), 0.6), (-60.0, 1e-9), (60.0, 1e9)):
+        assert _moved(model, ("floor",), np.array([step])).values["floor"] == pytest.approx(1e-4 * share)
+    known = typical()
+    median = {s.name: s.median for s in known.scales}["gravity"]
+    for step, share in ((-60.0, 5e-3), (60.0, 300.0)):
+        assert _moved(known, ("gravity",), np.array([step])).values["gravity"] == pytest.approx(share * median)
 
 
 @pytest.mark.parametrize("targets", [1, 2])

@@ -30,6 +30,7 @@ from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
 from calib_planner.errors import InputError, UnknownNameError
+from calib_planner.robot import Element
 from calib_planner.tracker import Isotropic, LaserTracker
 
 ROBOTS = {
@@ -97,6 +98,40 @@ def test_placement_columns_are_the_jacobian_and_priors_go_by_kind(robot: Robot) 
 def test_zeros_of_joints_are_what_acts_like_the_joint() -> None:
     robot = Robot.load("kuka_kr270").with_parameters("q1,q3,d2")
     assert joint_zeros(robot).tolist() == [True, True, False]
+
+
+def test_a_zero_of_a_joint_is_told_whatever_its_sign_and_wherever_the_targets_are() -> None:
+    """A parameter turns with the joint or against it; at the tip, on the last axis, nothing moves by a turn."""
+    elements = (
+        Element("Rz", parameter="pedestal"),  # a joint that turns backwards about the same axis
+        Element("Rz", joint=0, sign=-1.0),
+        Element("Tx", 0.4, parameter="upper"),
+        Element("Ry", joint=1, parameter="second"),
+        Element("Tx", 0.3, parameter="fore"),
+        Element("Rx", joint=2, parameter="third"),
+        Element("Tx", 0.1, parameter="hand"),
+        Element("Rz", parameter="flange"),
+    )
+    limits = np.array([[-2.0, 2.5], [-1.5, 1.0], [-3.0, 3.0]])
+    robot = Robot("signs", elements, (), ("a", "b", "c"), limits)
+    names = ("pedestal", "upper", "second", "fore", "third", "hand", "flange")
+    for target in ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2], [-0.13, 0.3, 0.1], [5.0, -3.0, 2.0]):
+        placed = replace(robot.with_targets([target]), parameter_names=(*names, "target_1.x"))
+        told = dict(zip(placed.parameter_names, joint_zeros(placed), strict=True))
+        assert {name for name, zero in told.items() if zero} == {"pedestal", "second", "third"}
+
+
+def test_a_stated_prior_takes_its_parameter_from_the_scale_and_moves_its_mean() -> None:
+    robot = Robot.load("kuka_kr270").with_parameters("d1,d2,q2")
+    values = {"placement.length": 4e-4, "placement.angle": 2e-3}
+    nominal = {p.name: p.nominal for p in robot.parameters}
+    stated = Placement(stated=Prior(("d2",), [nominal["d2"] + 3e-4], [3e-5]))
+    at = robot.parameter_names.index("d2")
+    plain, told = (p.gradients(robot, values)["placement.length"] for p in (Placement(), stated))
+    assert plain[at] == pytest.approx(2.0 * 4e-4**2) and told[at] == 0.0
+    np.testing.assert_array_equal(np.delete(told, at), np.delete(plain, at))
+    assert "placement.length" not in replace(stated, prior="flat").gradients(robot, values)
+    np.testing.assert_allclose(stated.means(robot), np.where(np.arange(3) == at, 3e-4, 0.0), atol=1e-12)
 
 
 @pytest.mark.parametrize("term", ["placement", "gravity", "joint_functions"])

@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 from robots import CASES, random_configurations
 
-from calib_planner.planning import CRITERIA, Feasibility, InformationModel
+from calib_planner import PlanProblem
+from calib_planner.error_model import Prior
+from calib_planner.measurements import Measurements
+from calib_planner.planning import CRITERIA, Feasibility, InformationModel, Search, plan_space
 from calib_planner.planning.criteria import (
     Compound,
     Eliminating,
+    WorstAccuracy,
     accuracy_weights,
+    is_sharp,
     make_criterion,
     reported_value,
+    sharpened,
 )
 from calib_planner.planning.search.multistart import SearchProblem, plan_objective
 from calib_planner.tracker import Isotropic, LaserTracker, covariance_gradient
@@ -179,3 +185,101 @@ def test_tracker_noise_gradient():
         step = h * np.eye(3)[k]
         expected = (TRACKER.covariance(points + step) - TRACKER.covariance(points - step)) / (2 * h)
         np.testing.assert_allclose(got[..., k], expected, rtol=1e-4, atol=1e-16)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("name", [name for name in CRITERIA if name not in ("o2", "o4")])
+def test_the_supporting_hyperplane_touches_at_its_matrix(name, unit):
+    """tr(G M) = Ψ(M); where Ψ is a largest or smallest of several, the sharper its smooth form the closer."""
+    made = criterion(name)
+    for matrix in unit * random_matrices(4, 7):
+        gradient = sharpened(made, 200.0).supporting_gradient(matrix)
+        assert np.sum(gradient * matrix) == pytest.approx(made.exact(matrix), rel=1e-6)
+        np.testing.assert_array_less(-1e-9 * np.abs(gradient).max(), np.linalg.eigvalsh(gradient))
+
+
+def test_a_sharper_form_is_closer_to_the_exact_criterion():
+    """By the factor of its exponent: the power mean of n values is off by log n / exponent at most, twice in O2,
+    thrice in O4. Criteria that are smooth, and the worst of one pose, have no other form."""
+    one = WorstAccuracy(accuracy_weights(np.random.default_rng(3).normal(size=(1, 3, SIZE))))
+    assert not is_sharp(one) and sharpened(one, 4.0) is one
+    within = Eliminating(criterion("e", 3), (0, 2, 4), (1, 3))
+    matrices, exponents = random_matrices(6, 3), {"worst_pose": 64.0, "o2": 16.0, "o4": 32.0 / 3.0}
+    for name, made in {**all_criteria(), "eliminating e": within}.items():
+        assert is_sharp(made) == (name in ("worst_pose", "e", "o2", "o3", "o4", "eliminating e")), name
+        near, exact = sharpened(made, 4.0), made.exact_values(matrices)
+        if not is_sharp(made):
+            np.testing.assert_allclose(near.value_and_gradient(matrices)[0], exact, rtol=1e-12)
+            continue
+        apart, less = (np.abs(np.log(m.value_and_gradient(matrices)[0] / exact)) for m in (made, near))
+        assert (less < apart).all() and (less <= np.log(SIZE) / exponents.get(name, 32.0) + 1e-12).all(), name
+        part = near.inner if name == "eliminating e" else near
+        assert (part.sharpness == 64.0) if name == "worst_pose" else (part.power == 32.0)
+        np.testing.assert_allclose(near.exact_values(matrices), exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("noise", [Isotropic(2e-5), TRACKER], ids=["isotropic", "tracker"])
+def test_information_is_the_jacobian_weighted_by_what_a_measurement_errs(noise):
+    """Jᵀ (Σ/r + σ_c²)⁻¹ J with the whole matrix written out; r the same for all, or one of each configuration."""
+    robot = CASES["mixed offsets"]()
+    q = random_configurations(robot, 3, 2)
+    for repetitions in (1, 4, np.array([1, 2, 5])):
+        model = InformationModel(robot, noise, configuration_sigma=3e-5, repetitions=repetitions)
+        expected = []
+        for row, times in zip(q, np.broadcast_to(repetitions, 3), strict=True):
+            whole = np.zeros((6, 6))
+            for target, point in enumerate(robot.positions(row)[0]):
+                own = slice(3 * target, 3 * target + 3)
+                whole[own, own] = noise.covariance(point) / times + 9e-10 * np.eye(3)
+            jacobian = robot.jacobian(row)[0]
+            expected.append(jacobian.T @ np.linalg.inv(whole) @ jacobian)
+        scale = np.abs(expected).max()
+        rows = model.whitened(q)
+        np.testing.assert_allclose(model.at(q), expected, rtol=0, atol=1e-10 * scale)
+        np.testing.assert_allclose(np.swapaxes(rows, 1, 2) @ rows, expected, rtol=0, atol=1e-10 * scale)
+        np.testing.assert_allclose(model.linearised(q).sums(1), expected, rtol=0, atol=1e-10 * scale)
+        np.testing.assert_allclose(model.totals(q, 3)[0], np.sum(expected, axis=0), rtol=0, atol=1e-9 * scale)
+
+
+def test_measurements_and_statements_beforehand_are_the_prior():
+    """M_0 of the paper's model: what is stated, and Jᵀ (Σ + σ_c²)⁻¹ J of every point that was seen."""
+    robot = CASES["kuka_kr270"]().with_targets([[0.0, 0.1, 0.05], [0.1, 0.0, 0.1]])
+    q = random_configurations(robot, 6, 2)
+    points = robot.positions(q).copy()
+    points[2, 0] = points[4, 1] = np.nan
+    problem = PlanProblem(
+        robot,
+        q[:1] / 3,
+        8,
+        noise=TRACKER,
+        configuration_sigma=3e-5,
+        prior=Prior(("q1", "d2"), [0.0, 0.0], [1e-4, 2e-4]),
+        measured=Measurements(robot.joint_names, q, points),
+    )
+    space = plan_space(problem)
+    names = space.robot.parameter_names
+    expected = np.zeros((len(names), len(names)))
+    for name, std in (("q1", 1e-4), ("d2", 2e-4)):
+        expected[names.index(name), names.index(name)] = std**-2
+    np.testing.assert_allclose(space.stated, expected, rtol=0, atol=1e-9 * expected.max())
+    jacobian = space.robot.jacobian(q).reshape(6, 2, 3, -1)
+    for visit, target in np.ndindex(6, 2):
+        if not np.isnan(points[visit, target]).any():
+            noise = TRACKER.covariance(points[visit, target]) + 9e-10 * np.eye(3)
+            own = jacobian[visit, target]
+            expected += own.T @ np.linalg.inv(noise) @ own
+    np.testing.assert_allclose(space.prior, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_search_gives_accuracy_elsewhere_its_share():
+    robot, matrix = CASES["kuka_kr270"](), None
+    tests = random_configurations(robot, 2, 5) / 2
+    for kind, share in (("test_pose", 0.3), ("test_pose", 0.0), ("worst_pose", 0.3), ("d", 0.3)):
+        space = plan_space(PlanProblem(robot, tests, 8, criterion=kind, search=Search(general_weight=share)))
+        size = len(space.prior)
+        matrix = random_matrices(1, 4, size)[0] if matrix is None else matrix
+        plain = space.criterion(kind).exact(matrix)
+        if kind == "test_pose":
+            general = np.trace(space.general @ np.linalg.inv(matrix))
+            plain = 1.0 / ((1.0 - share) / plain + share * general)
+        assert space.search_criterion().exact(matrix) == pytest.approx(plain, rel=1e-9)
