@@ -376,6 +376,8 @@ def error_variance(rows: FloatArray, inverse: FloatArray, hidden: FloatArray) ->
 def without_rigid_motion(points: FloatArray, rows: FloatArray) -> FloatArray:
     """What a common small motion of all points does not explain: Q · rows.
 
+    A column that it explains but for rounding is zero: nothing is felt there, not even relative to the others.
+
     Args:
         points: (K, targets, 3) at the test poses [m].
         rows: (3·K·targets, n).
@@ -394,7 +396,9 @@ def without_rigid_motion(points: FloatArray, rows: FloatArray) -> FloatArray:
     turns = np.cross(np.eye(3)[None], centred[:, None, :]).transpose(0, 2, 1)  # b × p
     motion = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2).reshape(-1, 6)
     basis = np.linalg.qr(motion)[0]
-    return np.asarray(rows - basis @ (basis.T @ rows))
+    left = rows - basis @ (basis.T @ rows)
+    left[:, np.linalg.norm(left, axis=0) <= ROUNDING * np.linalg.norm(rows, axis=0)] = 0.0
+    return np.asarray(left)
 
 
 def _spread(columns: FloatArray, matrix: FloatArray) -> FloatArray:

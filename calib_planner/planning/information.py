@@ -270,8 +270,9 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     """Prepare a problem.
 
     Raises:
-        InfeasibleError: The constraints leave nothing, no parameter can be identified, or the number of
-            configurations cannot identify them whichever they are.
+        InfeasibleError: The constraints leave nothing, no parameter can be identified, the number of
+            configurations cannot identify them whichever they are, or the accuracy at the test poses depends on
+            none of them.
     """
     names = problem.robot.parameter_names
     feasibility = Feasibility(problem.robot, problem.constraints)
@@ -307,6 +308,7 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         felt = accuracy_rows(*problem.robot.positions_and_jacobian(poses), frame)
         unseen = np.abs(felt @ identifiable.directions.T).max(axis=(1, 2), initial=0.0)
         blind = unseen > FELT * np.abs(felt).max()
+        _check_felt(problem, tests)
     columns = jacobians[:, :, free]
     general_floor = 0.0
     if isinstance(single, ExtendedModel):
@@ -413,6 +415,17 @@ def _check_enough(problem: PlanProblem, jacobians: FloatArray, prior: FloatArray
             f"{problem.configurations} configurations give at most "
             f"{problem.configurations * per_row} equations for {unknown} identifiable parameters; ask for "
             f"at least {needed}, or for fewer parameters",
+        )
+
+
+def _check_felt(problem: PlanProblem, tests: FloatArray) -> None:
+    """Refuse a criterion of an accuracy that no parameter changes; ``tests``: (K, 3·targets, p) rows of (M3)."""
+    wanted = any(name in POSE_CRITERIA for name in (problem.criterion, *problem.compound))
+    if wanted and not tests[problem.weight_array > 0].any():
+        raise InfeasibleError(
+            "test_poses",
+            f"no parameter that can be identified changes the accuracy {problem.accuracy_frame!r} at the test "
+            "poses; choose other test poses, another accuracy or a criterion of the parameters",
         )
 
 

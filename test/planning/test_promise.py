@@ -13,6 +13,7 @@ from scipy.stats import ortho_group
 
 from calib_planner import (
     IdentificationProblem,
+    InfeasibleError,
     InputError,
     Plan,
     PlanProblem,
@@ -25,6 +26,7 @@ from calib_planner.error_model import ErrorModel, Knowledge, Prior
 from calib_planner.measurements import Measurements
 from calib_planner.planning import Candidates, Pace, Search, plan_for_accuracy, plan_for_time
 from calib_planner.planning.planner import value_of
+from calib_planner.robot import Element
 
 SIGMA = 3e-5
 POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
@@ -157,3 +159,18 @@ def test_frames_that_are_refused() -> None:
         PlanProblem(kuka(), POSE, 4, accuracy_frame="tool")
     with pytest.raises(InputError, match="at least 4"):
         plan(PlanProblem(kuka(), POSE, 4, accuracy_frame="robot"))
+
+
+def test_an_accuracy_that_no_parameter_changes_is_refused() -> None:
+    """The errors of a gantry are rigid motions of all points, which the accuracy ``robot`` takes out."""
+    slides = (Element("T" + axis, 0.5, k, parameter=f"zero {axis}") for k, axis in enumerate("xyz"))
+    names, limits = ("x", "y", "z"), np.array([[-1.0, 1.0]] * 3)
+    gantry = Robot("gantry", tuple(slides), (), names, limits).with_targets([[0.1, 0.0, 0.2]])
+    gantry = gantry.with_parameters("zero x,zero y,zero z")
+    poses = random_configurations(gantry, 5)
+    problem = PlanProblem(gantry, poses, 4, accuracy_frame="robot", search=QUICK)
+    with pytest.raises(InfeasibleError, match="changes the accuracy 'robot' at the test poses"):
+        plan(problem)
+    assert plan(replace(problem, criterion="d")).quality.predicted_accuracy == 0.0
+    world = plan(replace(problem, accuracy_frame="world")).quality
+    assert world.predicted_accuracy == pytest.approx(SIGMA * np.sqrt(3 / 4))  # each coordinate by four points
