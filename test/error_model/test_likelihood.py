@@ -293,6 +293,65 @@ def test_left_out_residuals_are_those_of_a_refit_without_the_group(
     assert found.usable.sum() == 19
 
 
+def test_what_left_out_residuals_tell_is_what_their_covariances_say() -> None:
+    """Every number of a group from the dense P; points that are doubted or not seen do not count."""
+    plain, doubt = problem_of(9, 2, missing=((3, 1), (6, 0), (6, 1))), np.zeros((9, 2))
+    doubt[2, 0] = doubt[7, 1] = 1e-8
+    problem = replace(plain, parts={**plain.parts, "doubt": part_of(doubt)})
+    groups = np.array([1, 0, 0, 2, 3, 4, 5, 3, 6])
+    solution = dense(problem)
+    found = left_out(solution, groups)
+    seen = np.ones((9, 2), bool)
+    seen[3, 1] = seen[6] = False
+    np.testing.assert_array_equal(found.seen, seen)
+    np.testing.assert_array_equal(found.doubted, doubt > 0)
+    np.testing.assert_array_equal(found.usable, seen & (doubt == 0))
+    whole = np.zeros((54, 54))
+    for visit in range(9):
+        whole[6 * visit : 6 * visit + 6, 6 * visit : 6 * visit + 6] = problem.covariance[visit]
+    squares, variances, spread = [], [], 0.0
+    for group in range(7):
+        rows = np.concatenate([6 * v + np.arange(6) for v in np.flatnonzero(groups == group)])
+        measured, counts = (np.repeat(mask.ravel(), 3)[rows] for mask in (seen, found.usable))
+        if not measured.any():
+            assert found.freedom[group] == found.squares[group] == found.scores[group] == 0.0
+            continue
+        precision, own = (m[np.ix_(rows[measured], rows[measured])] for m in (solution.projection, whole))
+        covariance = np.linalg.inv(precision)
+        residual = covariance @ solution.weighted.ravel()[rows[measured]]
+        at, counted = found.residuals.reshape(-1)[rows[measured]], counts[measured]
+        np.testing.assert_allclose(at, residual, atol=1e-6 * np.abs(residual).max())
+        squares += list(np.sum(residual[counted].reshape(-1, 3) ** 2, axis=1))
+        variances += list(np.diag(covariance)[counted].reshape(-1, 3).sum(axis=1))
+        left = np.trace(own @ precision) / measured.sum()
+        expected = 2.0 * np.sum(covariance[np.ix_(counted, counted)] ** 2) * (2.0 - left)
+        assert found.spread[group] == pytest.approx(expected, rel=1e-5)
+        spread += expected
+        square = residual @ precision @ residual
+        assert found.squares[group] == pytest.approx(square, rel=1e-6)
+        density = np.linalg.slogdet(precision)[1] - square - measured.sum() * np.log(2.0 * np.pi)
+        assert found.scores[group] == pytest.approx(0.5 * density, rel=1e-6)
+    assert found.score == pytest.approx(found.scores.sum())
+    np.testing.assert_allclose(np.sort(found.distances**2), np.sort(squares), rtol=1e-5)
+    assert found.rms == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-6)
+    assert found.predicted_rms == pytest.approx(np.sqrt(np.mean(variances)), rel=1e-6)
+    expected = (found.rms / found.predicted_rms, np.sqrt(spread) / (2.0 * np.sum(variances)))
+    assert found.excess == pytest.approx(expected, rel=1e-5)
+
+
+def test_groups_of_one_visit_each_may_have_any_numbers() -> None:
+    """Asked for again in another order, the groups' numbers go with their visits."""
+    problem, order = problem_of(6, 1), np.array([4, 2, 0, 5, 1, 3])
+    solution = dense(problem)
+    first, again, fresh = left_out(solution), left_out(solution, order), left_out(dense(problem), order)
+    assert left_out(solution) is first
+    for name in ("squares", "freedom", "scores", "spread"):
+        np.testing.assert_allclose(getattr(again, name)[order], getattr(first, name), rtol=1e-12)
+        np.testing.assert_allclose(getattr(again, name), getattr(fresh, name), rtol=1e-9)
+    some = np.array([0, 1, 1, 2, 3, 4])
+    np.testing.assert_array_equal(left_out(solution, some).groups, some)
+
+
 @pytest.mark.parametrize(("visits", "targets"), [(12, 1), (15, 3), (40, 1), (30, 2)])
 def test_how_far_the_left_out_rms_is_from_its_prediction_by_chance(visits: int, targets: int) -> None:
     """Against the trace over all residuals, and against measurements drawn from the model."""
@@ -317,15 +376,28 @@ def test_how_far_the_left_out_rms_is_from_its_prediction_by_chance(visits: int, 
 def test_a_visit_that_alone_tells_a_direction_has_no_left_out_residual() -> None:
     robot = ur10e(1)
     q = np.tile(random_configurations(robot, 1), (6, 1)) / 3.0
-    q[3:, 0] += 0.2
-    q[5, 4] += 0.5  # the one visit that shows the fifth joint
+    q[5] += [0.1, 0.5, -0.4, 0.3, 0.5, 0.0]  # five visits at one configuration tell three of four zeros
     data, _ = simulated(robot, {}, 6, 0)
-    points = robot.positions(q)
+    points = robot.positions(q) + 3e-5 * np.random.default_rng(0).standard_normal((6, 1, 3))
     model = replace(ErrorModel.paper(3e-5), placement=Placement("flat"))
-    some = robot.with_parameters("wrist_2_joint.rz,shoulder_pan_joint.rz")
+    zeros = [f"{name}_joint.rz" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_2")]
+    some = robot.with_parameters(",".join(zeros))
     work = _Work(some, type(data)(robot.joint_names, q, points), model)
-    found = left_out(dense(work.linearised()))
+    solution = dense(work.linearised())
+    found = left_out(solution)
     assert np.isfinite(found.scores).all() and found.usable[:5].all()
+    # In the two directions that it has one in, the eigenvectors of R^½ P R^½, all is as for other visits.
+    assert found.freedom.tolist() == [3, 3, 3, 3, 3, 2]
+    assert found.spread[5] == 0.0 and not found.usable[5].any() and (found.spread[:5] > 0.0).all()
+    root = np.linalg.cholesky(solution.problem.covariance[5])
+    values, vectors = np.linalg.eigh(root.T @ solution.blocks[5] @ root)
+    assert values[0] < 1e-10 and values[1] > 1e-6
+    turned = vectors[:, 1:].T @ root.T @ solution.weighted[5]
+    residual = root @ vectors[:, 1:] @ (turned / values[1:])
+    np.testing.assert_allclose(found.residuals[5, 0], residual, atol=1e-6 * np.abs(residual).max())
+    assert found.squares[5] == pytest.approx(np.sum(turned**2 / values[1:]), rel=1e-6)
+    density = np.log(values[1:]).sum() - 2.0 * np.log(np.diag(root)).sum() - 3.0 * np.log(2.0 * np.pi)
+    assert found.scores[5] == pytest.approx(0.5 * (density - found.squares[5]), rel=1e-6)
 
 
 def test_thousands_of_points_are_the_same_problem() -> None:

@@ -61,3 +61,14 @@ def test_no_points_say_nothing() -> None:
     robot, data = measured(True, True, 0)
     none = Measurements(robot.joint_names, data.q, np.full(data.p.shape, np.nan))
     assert find_misplacement(robot, none).unknown == () and not find_misplacement(robot, none).unexplained
+
+
+@pytest.mark.parametrize(("visits", "unknown"), [(4, ()), (5, ("base",))])
+def test_more_points_than_base_and_targets_need_say_something(visits: int, unknown: tuple[str, ...]) -> None:
+    """Six unknowns of the base and three of each of two targets: four points are just enough, five tell."""
+    robot = Robot.load("kuka_kr270").with_targets([[0.05, 0.02, 0.12], [-0.1, 0.1, 0.05]])
+    q = random_configurations(robot, visits, 3)
+    points = robot.with_base(ELSEWHERE, [1.0, -2.0, 0.5]).positions(q).copy()
+    points[::2, 0] = points[1::2, 1] = np.nan
+    answer = find_misplacement(robot, Measurements(robot.joint_names, q, points))
+    assert answer.unknown == unknown and not answer.unexplained
