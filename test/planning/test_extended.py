@@ -322,6 +322,111 @@ def test_candidates_are_exchanged_until_no_other_is_better() -> None:
     assert found.quality.lower_bound <= found.quality.predicted_accuracy
 
 
+@pytest.mark.parametrize("robot", [kuka(), mixed()], ids=lambda robot: robot.name)
+def test_waves_of_a_joint_change_with_it_as_said(robot: Robot) -> None:
+    """A turn has cos nq and sin nq; a slide the same of its share of half a turn between its limits."""
+    model, q = (
+        ExtendedModel.of(robot, typical(), np.zeros((0, len(robot.joint_names)))),
+        random_configurations(robot, 3),
+    )
+    values, rates = extended.joint_features(model, Poses(robot, q))
+    sides = [extended.joint_features(model, Poses(robot, q + s))[0] for s in (1e-6, -1e-6)]
+    expected = (sides[0] - sides[1]) / 2e-6
+    np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    half = values.shape[2] // 2
+    scales = model.wave_scales[:half]
+    np.testing.assert_allclose(
+        values[..., :half] ** 2 + values[..., half:] ** 2, np.broadcast_to(scales**2, values[..., :half].shape)
+    )
+
+
+def test_slow_waves_and_what_test_poses_feel_stay() -> None:
+    """Three waves a turn, and a function for each of up to twelve test poses, as far as there are functions."""
+    robot = kuka()
+    poses = random_configurations(robot, 20, 3) / 3
+    for harmonics, felt, stay in ((30, 0, 6), (30, 2, 8), (30, 20, 18), (4, 20, 8), (4, 1, 7), (2, 20, 4)):
+        model = replace(typical(), joint_functions=JointFunctions(harmonics=harmonics))
+        basis = ExtendedModel.of(robot, model, poses[:felt]).basis
+        assert basis.shape == (6, 2 * harmonics, stay)
+        unit = np.swapaxes(basis, 1, 2) @ basis
+        np.testing.assert_allclose(unit, np.broadcast_to(np.eye(stay), unit.shape), atol=1e-9)
+        slow = [k for k in range(2 * harmonics) if k % harmonics < 3]
+        inside = basis @ np.swapaxes(basis, 1, 2)
+        np.testing.assert_allclose(
+            inside[:, slow], np.broadcast_to(np.eye(2 * harmonics)[slow], inside[:, slow].shape), atol=1e-9
+        )
+
+
+def test_the_floor_is_what_the_eliminated_functions_move_the_targets() -> None:
+    """By the coefficients' own covariance σ² (I − U Uᵀ) σ; nothing at up to twelve test poses."""
+    robot = mixed()
+    model = replace(typical(), joint_functions=JointFunctions(harmonics=8))
+    q = random_configurations(robot, 4, 2)
+    extension = ExtendedModel.of(robot, model, q[:2])
+    floor = extension.floor(q)
+    np.testing.assert_allclose(floor[:2], 0.0, atol=1e-9 * floor.max())
+    functions, expected = model.joint_functions, np.zeros(4)
+    assert functions is not None
+    columns = functions.columns(Poses(robot, q)).reshape(4, 6, 4, 16)
+    std = np.sqrt(functions.variances(robot, model.values)).reshape(4, 16)
+    for joint, basis in enumerate(extension.basis):
+        rest = std[joint][:, None] * (np.eye(16) - basis @ basis.T) * std[joint]
+        expected += np.einsum("nrf,fg,nrg->n", columns[:, :, joint], rest, columns[:, :, joint]) / 2.0
+    np.testing.assert_allclose(floor, expected, atol=1e-9 * floor.max())
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_a_robot_that_errs_more_or_less_is_another_problem(factor: float) -> None:
+    """Every part of the space of its sizes, with measurements beforehand, from those of the first."""
+    robot, given = kuka(), typical(Isotropic(3e-5))
+    q = random_configurations(robot, 6, 5) / 2
+    points = robot.positions(q).copy()
+    points[2] = np.nan
+    problem = PlanProblem(
+        robot, POSE, 6, error_model=given, measured=Measurements(robot.joint_names, q, points), repetitions=2
+    )
+    spread = dict(zip((0.25, 4.0), spread_spaces(plan_space(problem)), strict=True))[factor]
+    values = {name: value * factor for name, value in given.values.items() if name in UNCERTAIN}
+    whole = plan_space(replace(problem, error_model=given.with_values(values, name="stated")))
+    assert spread_spaces(whole) == ()
+    signs = np.sign(np.einsum("jfb,jfb->jb", spread.model.basis, whole.model.basis)).ravel()
+    turn = np.concatenate([np.ones(len(whole.prior) - len(signs)), signs])  # of the columns of U_l
+
+    def same(got: np.ndarray, want: np.ndarray) -> None:
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-6 * np.abs(want).max())
+
+    same(spread.test_jacobians * turn, whole.test_jacobians)
+    same(spread.test_floor, whole.test_floor)
+    same(spread.general * np.outer(turn, turn), whole.general)
+    same(spread.prior * np.outer(turn, turn), whole.prior)
+    assert spread.general_floor == pytest.approx(whole.general_floor, rel=1e-6)
+    for one, other in ((spread.model, whole.model), (spread.single, whole.single)):
+        same(one.totals(q, 6)[0] * np.outer(turn, turn), other.totals(q, 6)[0])
+
+
+def test_measurements_beforehand_tell_what_all_visits_and_the_errors_of_their_joints_do() -> None:
+    """Xᵀ V⁻¹ X with V of all points that were seen, run by run beyond sixty visits."""
+    robot = kuka().with_targets([[0.0, 0.1, 0.05], [0.1, 0.0, 0.1]])
+    q = random_configurations(robot, 62, 5) / 2
+    points, seen = robot.positions(q).copy(), np.ones((62, 2), bool)
+    seen[1, 0] = seen[3] = seen[61, 1] = False
+    points[~seen] = np.nan
+    problem = PlanProblem(
+        robot, POSE, 6, error_model=typical(TRACKER), measured=Measurements(robot.joint_names, q, points)
+    )
+    space = plan_space(problem)
+    assert isinstance(space.single, ExtendedModel)
+    expected = np.eye(len(space.prior))
+    expected[: len(space.stated), : len(space.stated)] = space.stated
+    for part in (np.arange(60), np.arange(60, 62)):
+        info = space.single.linearised(q[part])
+        use = np.flatnonzero(np.repeat(seen[part].ravel(), 3))
+        rows = info.jacobian.reshape(6 * len(part), -1)[use]
+        whole = info.covariance(len(part))[0][use][:, use]
+        expected += rows.T @ np.linalg.inv(whole) @ rows
+    np.testing.assert_allclose(space.prior, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
 def test_a_prior_and_measurements_only_help() -> None:
     robot, model = kuka(("base", "tool")), typical(Isotropic(3e-5))
     q = random_configurations(robot, 12, 3)
