@@ -149,3 +149,17 @@ def test_a_larger_sigma_scales_what_is_uncertain_and_moves_nothing(seed: int) ->
     apart = np.abs(other.fit.deviations - one.fit.deviations)[there] / one.fit.std[there]
     assert there.any() and apart.max() < 1e-6
     np.testing.assert_allclose(other.fit.std[there], 3 * one.fit.std[there], rtol=1e-7)
+
+
+@pytest.mark.parametrize("seed", repeats(range(2), range(20)))
+def test_the_same_data_twice_halve_the_variances_and_move_nothing(seed: int) -> None:
+    """Information is a sum over the rows: flat parameters and independent noise leave nothing else."""
+    robot = placed_chain(seed)
+    data, poses = measured(robot, 20, seed), random_configurations(robot, 4, seed + 1)
+    twice = Measurements(data.joint_names, np.tile(data.q, (2, 1)), np.tile(data.p, (2, 1, 1)))
+    one, other = (identified(robot, d, test_poses=poses, loss="linear") for d in (data, twice))
+    there = np.isfinite(one.fit.std)
+    apart = np.abs(other.fit.deviations - one.fit.deviations)[there] / one.fit.std[there]
+    assert there.any() and apart.max() < 1e-6
+    np.testing.assert_allclose(other.fit.std[there], one.fit.std[there] / np.sqrt(2.0), rtol=1e-7)
+    np.testing.assert_allclose(other.accuracy.predicted, one.accuracy.predicted / np.sqrt(2.0), rtol=1e-7)
