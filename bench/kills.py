@@ -23,9 +23,9 @@ phase is entered and a random time more. A node starts in some tenths of a secon
 from this one, which has imported everything and has not touched ROS. Everything random comes from the seed; where
 in the code a kill hits depends on the machine as well.
 
-Stamps run about a hundred times as fast as the clock, so that what is a moment to DDS is seconds to them. Nothing
+Stamps run a hundred times as fast as the clock, so that what is a moment to DDS is seconds to them. Nothing
 of that may be lost, or what is measured would depend on it. So the topics are reliable and transient local: a
-fresh node, and one who listens to it, hear all from the beginning. And each stream waits for the other for as long
+fresh node, and one who listens to it, hear all from the beginning. And each stream waits for the other as long
 as a row takes (``SKEW``), since one may be fetched some messages later. Every row is shown once.
 
     python bench/kills.py                       # 1 000 kills, a quarter of an hour on two cores
