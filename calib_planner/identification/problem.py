@@ -76,7 +76,7 @@ class IdentificationProblem(Told):
     def __post_init__(self) -> None:
         put = object.__setattr__
         if not self.robot.parameter_names:
-            raise InputError("robot", "a robot without active parameters", "use robot.with_parameters(...)")
+            raise InputError("robot", "no active parameters", "at least one", "use robot.with_parameters(...)")
         put(self, "data", self.data.in_order_of(self.robot.joint_names))
         targets = len(self.robot.targets)
         if self.data.p.shape[1] != targets:

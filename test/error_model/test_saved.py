@@ -106,3 +106,24 @@ def test_the_file_to_begin_from_is_the_typical_model() -> None:
     from calib_planner.io.robots import config_folder
 
     assert read_error_model(config_folder() / "error_models" / "typical.yaml") == typical()
+
+
+def test_an_instrument_of_ones_own_cannot_be_saved() -> None:
+    class Ruler(Isotropic):
+        pass
+
+    class Eye:
+        typical = 1e-3
+
+        def covariance(self, points: np.ndarray) -> np.ndarray:
+            return 1e-6 * np.ones((*points.shape[:-1], 1, 1)) * np.eye(3)
+
+    assert to_mapping(typical(Ruler(1e-5)))["points"]["noise"]["kind"] == "isotropic"
+    with pytest.raises(InputError, match=r"points\.noise: expected one of isotropic"):
+        to_mapping(typical(Eye()))  # type: ignore[arg-type]
+
+
+def test_a_prior_is_equal_to_its_like_only() -> None:
+    prior = Prior(("d1",), [0.5], [1e-4])
+    assert prior == Prior(("d1",), [0.5], [1e-4]) and hash(prior) == hash(Prior(("d1",), [0.5], [1e-4]))
+    assert prior != Prior(("d1",), [0.5], [2e-4]) and prior != ("d1",) and prior is not None

@@ -289,3 +289,7 @@ def test_a_model_needs_its_scales_and_some_noise() -> None:
     assert [s.name for s in slim.scales] == ["repeatability", "floor"]
     with pytest.raises(UnknownNameError):
         slim.with_values({"gravity": 1.0})
+    with pytest.raises(UnknownNameError, match="joint_functions, visits"):
+        slim.without("placement")
+    with pytest.raises(UnknownNameError, match="tolerance"):
+        Placement("tight")

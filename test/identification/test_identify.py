@@ -25,6 +25,7 @@ from calib_planner.error_model import ErrorModel
 from calib_planner.identification.registration import register
 from calib_planner.robot.elements import rotation
 from calib_planner.simulation import SimulatedCell, random_deviations
+from calib_planner.tracker import Isotropic
 
 SIGMA = 3e-5
 
@@ -167,6 +168,16 @@ def _kuka_data(count=6):
     [
         (lambda r, d: IdentificationProblem(r.with_targets(np.zeros((2, 3))), d), InputError, "1 targets"),
         (lambda r, d: IdentificationProblem(r, d, sigma=-1.0), InputError, "sigma"),
+        (
+            lambda r, d: IdentificationProblem(dataclasses.replace(r, parameter_names=()), d),
+            InputError,
+            "at least one",
+        ),
+        (
+            lambda r, d: IdentificationProblem(r, d, sigma=1e-5, instrument=Isotropic(1e-5)),
+            InputError,
+            "sigma: expected one of the two",
+        ),
         (lambda r, d: IdentificationProblem(r, d, loss="huge"), UnknownNameError, "linear"),
         (lambda r, d: IdentificationProblem(r, d, test_poses=np.zeros(3)), InputError, "joint_a1"),
         (lambda r, d: Measurements(("a",) * 6, d.q, d.p).in_order_of(r.joint_names), InputError, "joint_a1"),

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from robots import mixed, random_configurations
 
-from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, UnknownNameError, plan
-from calib_planner.planning import Search, visiting_order
+from calib_planner import InfeasibleError, InputError, Measurements, PlanProblem, Robot, UnknownNameError, plan
+from calib_planner.planning import Candidates, Search, visiting_order
 from calib_planner.planning.search.descent import descend
 
 TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
@@ -20,6 +21,9 @@ TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
 
 def kuka():
     return Robot.load("kuka_kr270")
+
+
+TWO_TARGETS = Measurements(kuka().joint_names, np.zeros((2, 6)), np.zeros((2, 2, 3)))
 
 
 @pytest.mark.parametrize("m", [3, 4, 12])
@@ -150,6 +154,16 @@ def test_visiting_order_shortens_travel():
         ({"seed": -1}, "seed", "from 0"),
         ({"starts": 0}, "starts", "from 1"),
         ({"robot": "kuka_kr270"}, "robot", "Robot.load"),
+        ({"robot": replace(kuka(), parameter_names=())}, "robot", "with_parameters"),
+        ({"candidates": Candidates(np.zeros((3, 6)))}, "candidates", "at least 4"),
+        (
+            {"measured": TWO_TARGETS},
+            "measured",
+            "1, as the robot",
+        ),
+        ({"compound": {"o2": 0.5}}, "compound", "concave"),
+        ({"compound": {"best": 0.5}}, "compound", "one of"),
+        ({"compound": {"d": 0.5, "a": 0.5}}, "compound", "leave some weight"),
     ],
 )
 def test_refusals(change, field, needle):

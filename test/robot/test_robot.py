@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from robots import mixed, random_configurations
 
 from calib_planner import FileFormatError, InputError, Robot, UnknownNameError
 from calib_planner.io import shipped_robots
+from calib_planner.robot import Element, LinkMass, joint_origins, with_origins
 from calib_planner.robot.elements import rotation
 
 
@@ -93,6 +95,14 @@ def test_parameter_requests(request_, unknown, names):
         (lambda r: r.jacobian(np.zeros(6), np.zeros(3)), "deviations", "(9)"),
         (lambda r: r.with_deviations({"nope": 1.0}), "deviations", "one of"),
         (lambda r: r.with_targets([[0.0, 1.0]]), "targets", "(any, 3)"),
+        (lambda r: r.with_parameters([]), "parameters", "at least one parameter, got nothing; levels: offsets"),
+        (lambda r: replace(r, parameter_names=("q7",)), "parameters", "one of"),
+        (lambda r: replace(r, elements=(*r.elements, r.elements[-1])), "elements", "each parameter name once"),
+        (lambda r: replace(r, link_masses=(LinkMass(6, 1.0),)), "link_masses", "joint number 6"),
+        (lambda r: with_origins(r, {}), "origins", "joint_a1"),
+        (lambda r: Element("Sx"), "element", "Tx"),
+        (lambda r: Element("Rx", np.inf), "element Rx", "finite"),
+        (lambda r: Element("Tz", 0.1, sign=0.5), "element Tz: sign", "+1 or -1"),
     ],
 )
 def test_refusals_name_the_field_and_what_is_valid(call, field, needle):
@@ -100,6 +110,16 @@ def test_refusals_name_the_field_and_what_is_valid(call, field, needle):
         call(Robot.load("kuka_kr270"))
     assert caught.value.field == field
     assert needle in str(caught.value)
+
+
+def test_fixed_joints_place_the_tip_of_a_urdf_and_no_other_pose():
+    robot = mixed()
+    origins = joint_origins(robot)
+    assert origins.tip is None
+    with pytest.raises(InputError, match="fixed joints place the tip"):
+        with_origins(robot, origins.joints, origins.joints["nod"])
+    q = random_configurations(robot, 3)
+    np.testing.assert_allclose(with_origins(robot, origins.joints).positions(q), robot.positions(q), atol=1e-14)
 
 
 def test_unknown_robot():
