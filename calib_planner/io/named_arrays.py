@@ -94,8 +94,9 @@ def read_json(path: str | Path, text: str) -> RawLines:
     units: dict[str, str] = {}
     if isinstance(document, dict):
         said = document.pop("units", {})
-        if isinstance(said, str):
-            said = {word: word for word in re.split(r"[\s,]+", said)}
+        if isinstance(said, (str, list)):
+            text = said if isinstance(said, str) else " ".join(map(str, said))
+            said = {word: word for word in re.split(r"[\s,]+", text)}
         if isinstance(said, dict):
             units = {str(k): str(v) for k, v in said.items()}
         inner = [k for k, v in document.items() if _is_records(v)]
