@@ -24,6 +24,23 @@ ASKED = {
     "budget": 40,
 }
 S = CampaignStatus
+IDENTIFIER = {
+    "robot": "planar_2r",
+    "plan_topic": f"{NAME}/plan",
+    "settle": 0.05,
+    "duration": 0.1,
+    "samples": 5,
+    "sigma": 1.5e-5,
+}
+"""With ``SIMULATOR``, a visit is as exact as one of 20 points of 30 µm, and takes a third of the time."""
+SIMULATOR = {
+    "robot": "planar_2r",
+    "error_model": "paper",
+    "joint_speed": 100.0,
+    "dwell": 0.25,
+    "sigma": 1.5e-5,
+    "seed": 3,
+}
 
 
 class Desk:

@@ -12,7 +12,7 @@ import pytest
 from bench import Bench
 from calib_planner_msgs.msg import CalibrationEstimate
 from calib_planner_msgs.msg import Plan as PlanMessage
-from desk import NAME, Desk, S
+from desk import IDENTIFIER, NAME, SIMULATOR, Desk, S
 from fake_cell import FakeCell
 from robots import repeats
 
@@ -23,8 +23,6 @@ from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import EVENTS, LATCHED
 
-IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan"}
-SIMULATOR = {"robot": "planar_2r", "error_model": "paper", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 VALIDATION = 3
 """Configurations of a validation, as the desk asks for them."""
 

@@ -16,7 +16,7 @@ import pytest
 from bench import Bench
 from calib_planner_msgs.msg import CalibrationEstimate, JointConfiguration, Measurement, Verdict
 from calib_planner_msgs.msg import Plan as PlanMessage
-from desk import ASKED, NAME, Desk, S
+from desk import ASKED, IDENTIFIER, NAME, SIMULATOR, Desk, S
 from fake_cell import FakeCell
 from geometry_msgs.msg import Point
 from rclpy.parameter import Parameter
@@ -34,9 +34,6 @@ from calib_planner.ros.nodes.identifier import IdentifierNode
 from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import EVENTS, LATCHED
 from calib_planner.simulation import random_deviations
-
-IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAME}/plan"}
-SIMULATOR = {"robot": "planar_2r", "error_model": "paper", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 pytest.importorskip("aiohttp", reason="the page needs aiohttp (extra page)")
 sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
 from browser import Browser, Tab, browser
-from desk import ASKED
+from desk import ASKED, IDENTIFIER, SIMULATOR
 
 from calib_planner.ros.nodes.campaign import CampaignNode
 from calib_planner.ros.nodes.identifier import IdentifierNode
@@ -36,8 +36,6 @@ from calib_planner.ros.nodes.simulator import SimulatorNode
 from calib_planner.ros.parameters import EVENTS, HISTORY, LATCHED, SENSOR_OUT
 
 S = CampaignStatus
-IDENTIFIER = {"robot": "planar_2r", "plan_topic": f"{NAMES['campaign']}/plan", "keep_measurements": True}
-SIMULATOR = {"robot": "planar_2r", "error_model": "paper", "joint_speed": 12.0, "dwell": 0.7, "seed": 3}
 
 
 class Others(Node):
@@ -300,8 +298,8 @@ def test_a_campaign_by_clicks_alone(
 
 def test_a_campaign_of_the_real_nodes_by_clicks_alone(bench: Bench, chromium: Browser, tmp_path: Path) -> None:
     """Start, look at the plan, leave one out, resume, pause, resume; then the verdict and the report."""
-    bench.start(SimulatorNode, **SIMULATOR)
-    bench.start(IdentifierNode, **IDENTIFIER, save_folder=str(tmp_path))
+    bench.start(SimulatorNode, **(SIMULATOR | {"dwell": 0.6}))  # there is time for clicks while it measures
+    bench.start(IdentifierNode, **IDENTIFIER, keep_measurements=True, save_folder=str(tmp_path))
     bench.start(CampaignNode, **(ASKED | {"review": True}))
     page = bench.start(PageNode, port=0, executor="tracker_simulator", report_folder=str(tmp_path))
     tab = chromium.open(page.url, 360, 740)
