@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test prove fuzz mutation docs lint wheel bench soak faults clean
+.PHONY: help setup demo test prove fuzz mutation coverage docs lint wheel bench soak faults clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -28,6 +28,9 @@ fuzz: setup ## fuzz every reader and message conversion, ten minutes each (FUZZ=
 
 mutation: setup ## mutants of formulas that no test catches; all take hours (MUTATION='--sample 20'; JSON to results/)
 	@. ./env.sh && OMP_NUM_THREADS=1 python tools/mutation $(MUTATION)
+
+coverage: setup ## share of the core's branches that tests take: build/coverage/index.html (a quarter of an hour)
+	@. ./env.sh && OMP_NUM_THREADS=1 python tools/core_coverage.py $(COVERAGE)
 
 docs: setup ## make the documentation: build/docs/index.html (warnings are errors; reference pages from the code)
 	@. ./env.sh && python tools/reference && \

@@ -45,7 +45,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_planner.arrays import FloatArray
-from calib_planner.errors import InfeasibleError
 from calib_planner.planning.criteria import Criterion, is_sharp, sharpened
 from calib_planner.planning.extended import ExtendedModel, LinearisedExtension
 from calib_planner.planning.feasibility import Feasibility, PlanWalls
@@ -75,7 +74,8 @@ class DesignProblem:
         prior: (p, p) M_0.
         visits: m.
         feasibility: Where measuring is possible.
-        candidates: (C, joints) the only configurations there are, or ``None`` for all within the limits.
+        candidates: (C, joints) the only configurations there are, some of them feasible, or ``None`` for all
+            within the limits.
         distinct: Whether every candidate may be chosen once only.
     """
 
@@ -139,8 +139,6 @@ def approximate_design(
     if problem.candidates is None:
         return _grown(problem, *_first_measure(problem, start, rng), rng, cancel, rounds=rounds, gap=gap)
     q = problem.candidates[problem.feasibility.mask(problem.candidates)]
-    if not len(q):
-        raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
     rows = np.concatenate(results_of(executor, _whitened, [(problem.model, part) for part in cut(q)]))
     distinct = problem.visits if problem.distinct else None
     design = candidate_design(rows, problem.criterion, problem.prior, problem.visits, distinct, cancel)
@@ -454,8 +452,6 @@ def _extended_design(
     candidates = problem.candidates
     if candidates is not None:
         candidates = candidates[feasibility.mask(candidates)]
-        if not len(candidates):
-            raise InfeasibleError("candidates", "no row of the candidates satisfies the constraints")
         drawn = candidates[rng.permutation(len(candidates))]
     else:
         drawn = np.concatenate([start, feasibility.sample(rng, SPREAD)])

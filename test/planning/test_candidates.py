@@ -15,7 +15,7 @@ from robots import SHARED_DATA, random_configurations
 from calib_planner import Robot
 from calib_planner.error_model import typical
 from calib_planner.errors import InfeasibleError
-from calib_planner.planning import Candidates, PlanProblem, Search, plan
+from calib_planner.planning import Candidates, PlanProblem, Search, plan, plan_space
 from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
 from calib_planner.planning.planner import value_of
@@ -211,6 +211,31 @@ def test_many_choices_are_not_enumerated() -> None:
     assert best_of_all(problem, problem.criterion, lambda matrix: 0.0) is None
     few = ChoiceProblem(pool(0, 6), Determinant(), np.zeros((P, P)), 4)
     assert best_of_all(few, few.criterion, lambda matrix: 0.0, lambda: True) is None
+
+
+@pytest.mark.parametrize("name", ["d", "a", "d, whole error model", "a, whole error model"])
+def test_a_choice_that_is_cancelled_is_whole_and_no_better(name: str) -> None:
+    """Cancelled at its n-th question, the exchange gives as many rows as were wanted, no candidate twice."""
+    criterion, size = CRITERIA[name[0]], 4
+    if "whole" in name:
+        robot = Robot.load("planar_2r")
+        q = random_configurations(robot, 14, 1)
+        asked = PlanProblem(robot, q[:1], size, criterion=name[0], error_model=typical(Isotropic(3e-5)))
+        space = plan_space(asked)
+        info = space.model.linearised(q)
+        problem = ChoiceProblem(info.whitened, space.criterion(name[0]), space.prior, size, together=info)
+    else:
+        problem = ChoiceProblem(pool(3, 14), criterion, np.zeros((P, P)), size)
+    whole = choose(problem, np.random.default_rng(0))
+    starts = []
+    for most in (0, 1, size + 1):
+        left = iter(range(most))
+        early = choose(problem, np.random.default_rng(0), lambda left=left: next(left, None) is None)  # type: ignore[misc]
+        assert len(set(early.rows.tolist())) == size
+        assert early.log_value <= whole.log_value + 1e-9
+        assert early.evaluations < whole.evaluations
+        starts.append(early.starts)
+    assert starts[0] == 1 and starts == sorted(starts)
 
 
 def test_repeats_only_when_allowed() -> None:
