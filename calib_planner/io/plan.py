@@ -81,6 +81,8 @@ def parse_plan(document: Node, finite: Sequence[str] = FINITE) -> Plan:
     values = {name: document[name].of_kind(KINDS[name]) for name in KEYS}
     for name, axes in SHAPES.items():
         wanted = tuple(len(values[a]) for a in axes)
+        if not values[name].size and 0 in wanted:  # a list without rows does not tell their length
+            values[name] = values[name].reshape(wanted)
         if values[name].shape != wanted:
             expected = f"an array of shape {wanted} (as {', '.join(axes)})"
             raise document[name].error(f"shape {values[name].shape}", expected)

@@ -12,7 +12,7 @@ import pytest
 from stores import begun, decision, opened, standstill
 from test_campaign_record import GOALS, PROBLEM, ROBOT, noted, old_journal, reopened
 
-from calib_planner import FileFormatError, Plan
+from calib_planner import FileFormatError, Plan, PlanProblem, plan
 from calib_planner.acquisition import Rejection, RejectionReason
 from calib_planner.campaign import CampaignResult, NextStep, begin
 from calib_planner.errors import StoreError
@@ -20,6 +20,7 @@ from calib_planner.identification import Verdict
 from calib_planner.io import SessionStore, begin_campaign, open_campaign
 from calib_planner.io import store as store_file
 from calib_planner.io.store import CAMPAIGN_FILE, FILE, JOURNAL, MIGRATIONS, plan_of, plan_text, record_of
+from calib_planner.planning import Search
 
 
 def changed(path: Path, sql: str, *values: object) -> None:
@@ -81,8 +82,18 @@ def test_only_an_accepted_standstill_has_points() -> None:
         decision(moved, "moved", number=7).standstill
 
 
-def test_no_plan_is_none_on_both_ways() -> None:
+def test_a_plan_without_test_poses_and_no_plan_come_back(tmp_path: Path) -> None:
     assert plan_text(None) is None and plan_of("memory", None) is None
+    made = plan(PlanProblem(ROBOT, None, 4, criterion="d", search=Search(starts=1)))
+    store = opened(tmp_path)
+    begun(store, "p", made)
+    store.close()
+    again = opened(tmp_path)
+    found = again.current()
+    again.close()
+    assert found is not None and found.plan is not None
+    assert found.plan.test_poses.shape == (0, 2) and found.plan.weights.shape == (0,)
+    np.testing.assert_array_equal(found.plan.configurations, made.configurations)
 
 
 def test_nothing_decided_writes_nothing(store: SessionStore) -> None:
