@@ -122,6 +122,8 @@ def test_forms_of_values(folder: Path, text: str, field: str, value: object) -> 
         ("mounting: [0, 0, 0]", ["mounting", "not zero"]),
         ("couple: [j3=j2]", ["couple[0]", "JOINT+=JOINT"]),
         ("unknown: flange", ["unknown", "base, tool"]),
+        ("unknown: [base, 3]", ["unknown", "names with commas between, or a list of names"]),
+        ("unknown: 'base,,tool'", ["unknown", "names with commas between, or a list of names"]),
         ("units: inch", ["units", "mm, deg"]),
         ("accuracy-frame: tool", ["accuracy-frame", "world, robot"]),
         ("mounting: floor\nvertical: [0, 0, 1]", ["vertical", "one of the two"]),
@@ -168,6 +170,27 @@ def test_a_cell_that_says_little(folder: Path) -> None:
         cell_of(folder, "sigma: 20um").load_robot()
     with pytest.raises(FileFormatError, match="mounting: expected an error model with gravity"):
         cell_of(folder, "error-model: paper\nmounting: ceiling").load_error_model(cell.load_robot())
+
+
+def test_couplings_and_a_vertical_are_of_the_robot_and_its_gravity(folder: Path) -> None:
+    cell = cell_of(folder, "robot: planar_2r\ncouple: q2+=q1\nvertical: 0 -1 0\n")
+    robot = cell.load_robot()
+    np.testing.assert_allclose(robot.motions(np.array([[0.3, 0.5]])), [[0.3, 0.2]])
+    gravity = cell.load_error_model(robot).gravity
+    assert gravity is not None and gravity.vertical == (0.0, -1.0, 0.0)
+    plain = cell_of(folder, "robot: planar_2r\nerror-model: paper\n")
+    assert plain.load_error_model(robot).gravity is None
+
+
+def test_test_poses_of_a_cell_and_of_the_file_that_it_names_are_one_list(folder: Path) -> None:
+    (folder / "path.csv").write_text("q1,q2\n30,40\n50,60\n")
+    cell = cell_of(folder, "robot: planar_2r\nunits: deg\ntest-pose: 10 20\ntest-path: ../path.csv\n")
+    poses = cell.load_test_poses(cell.load_robot())
+    np.testing.assert_allclose(np.degrees(np.asarray(poses)), [[10, 20], [30, 40], [50, 60]])
+    assert cell_of(folder, "robot: planar_2r").load_test_poses(cell.load_robot()) is None
+    cell = cell_of(folder, "robot: planar_2r\ntest-pose: 0 1 2\n")
+    with pytest.raises(FileFormatError, match="test-pose: expected 2 numbers a pose: q1, q2, got 3 numbers"):
+        cell.load_test_poses(cell.load_robot())
 
 
 def test_what_is_written_is_read(folder: Path) -> None:

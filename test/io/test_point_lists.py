@@ -169,3 +169,41 @@ def test_points_that_belong_to_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="--point-columns"):
         (tmp_path / "strange.txt").write_text("1 2\n3 4\n")
         read(joints, tmp_path / "strange.txt")
+
+
+def test_a_list_of_points_may_have_standard_deviations_and_all_or_none_have(tmp_path: Path) -> None:
+    joints = joints_file(tmp_path, NAMES, "name")
+    one, two = tmp_path / "one.csv", points_file(tmp_path, NAMES, name="two.txt")
+    rows = [[NAMES[i], *map(repr, (1e3 * P[i]).tolist()), "0.01", "0.02", repr(0.01 * (i + 1))] for i in SHUFFLED]
+    one.write_text(
+        "name,x[mm],y[mm],z[mm],std_x[mm],std_y[mm],std_z[mm]\n" + "\n".join(map(",".join, rows)) + "\n"
+    )
+    source = read_data(joints, ROBOT, Reading(points=(str(one),)))
+    np.testing.assert_allclose(source.data.p[:, 0], P, rtol=0, atol=1e-12)
+    expected = [[1e-5, 2e-5, 1e-5 * (i + 1)] for i in range(COUNT)]
+    np.testing.assert_allclose(np.asarray(source.data.std)[:, 0], expected, rtol=1e-9)
+    with pytest.raises(FileFormatError, match="no standard deviations; add them, or remove them") as caught:
+        read_data(joints, ROBOT, Reading(points=(str(one), str(two))))
+    assert caught.value.path == str(two)
+
+
+def test_one_time_twice_tells_no_row(tmp_path: Path) -> None:
+    times = [repr(t) for t in TIMES.tolist()]
+    joints = joints_file(tmp_path, [*times[:-1], times[0]], "time")
+    points = points_file(tmp_path, times, header="t x y z")
+    with pytest.raises(FileFormatError, match="has one time twice"):
+        read(joints, points, match="time")
+    _, told = read(joints, points)
+    assert "by order (not by time: " in told and "has one time twice): 12 of 12 rows" in told
+
+
+def test_fractions_of_seconds_may_have_any_number_of_digits(tmp_path: Path) -> None:
+    """Also more than Python 3.10 reads, and none."""
+    texts = [f"2026-11-28 09:00:{10 + i}" + "." * (i > 0) + "1234567"[:i] for i in range(8)]
+    texts += [f"2026-11-28T09:00:{30 + i}.5Z" for i in range(4)]
+    points, told = read(
+        joints_file(tmp_path, texts, "time"),
+        points_file(tmp_path, texts, header="time;x;y;z", separator=";", order=SHUFFLED),
+    )
+    np.testing.assert_allclose(points[:, 0], P, rtol=0, atol=1e-12)
+    assert "by time: 12 of 12 rows" in told

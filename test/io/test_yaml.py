@@ -349,6 +349,10 @@ BAD_ESTIMATES: dict[str, tuple[dict[str, Any], str]] = {
         {"verdict": {"level": "PASS", "reasons": [{"level": "PASS"}]}},
         r"reasons\[0\]\.code: .*no key",
     ),
+    "reasons of words": (
+        {"verdict": {"level": "PASS", "reasons": "none"}},
+        r"verdict\.reasons: .*a list of reasons",
+    ),
     "verdict of words": ({"verdict": "PASS"}, "verdict: .*got str"),
     "error model": ({"error_model": {"terms": []}}, r"error_model\.model: .*no key"),
     "kind": ({"format": "calib_planner/plan"}, "expected calib_planner/estimate"),
@@ -363,6 +367,15 @@ def test_flawed_estimates_are_refused(tmp_path: Path, written: str, case: str) -
     with pytest.raises(FileFormatError, match=message) as caught:
         read_estimate(change(path, **changes))
     assert str(path) in str(caught.value)
+
+
+def test_an_estimate_of_the_same_parameter_twice_is_refused(tmp_path: Path, written: str) -> None:
+    path = tmp_path / "estimate.yaml"
+    path.write_text(written)
+    rows = yaml.load(written, LOADER)["parameters"]
+    rows[2]["name"] = rows[1]["name"]
+    with pytest.raises(FileFormatError, match="parameters: expected each name once, got a name twice"):
+        read_estimate(change(path, parameters=rows))
 
 
 @pytest.mark.parametrize("column", ["nominal", "value", "deviation"])
