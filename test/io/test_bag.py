@@ -37,7 +37,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from calib_planner import IdentificationProblem, identify
 from calib_planner.acquisition import Rejection, Standstill, StandstillDetector, StandstillSettings
-from calib_planner.errors import FileFormatError
+from calib_planner.errors import FileFormatError, InputError
 from calib_planner.io import BagTopics, Reading, StoredModel, is_bag, open_store, read_bag, read_sources
 from calib_planner.io.bag import storage_parts
 from calib_planner.ros.session import Matching, Session
@@ -298,3 +298,18 @@ def test_a_large_bag_is_read_as_a_stream(tmp_path: Path, plugin: str) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(found.data) == len(STOPS) and size > 25e6 and peak < size / 2
+
+
+@pytest.mark.parametrize(
+    ("topics", "field"),
+    [
+        ({"points": ()}, "topics"),
+        ({"points": ("p", "/p")}, "topics"),
+        ({"points": ("p", "q"), "children": ("ball",)}, "children"),
+        ({"points": ("p", "q"), "states": ("a", "b", "c")}, "states"),
+    ],
+)
+def test_topics_that_are_not_one_per_target_are_refused(topics: dict[str, tuple[str, ...]], field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        BagTopics(**topics)
+    assert caught.value.field == field

@@ -203,6 +203,7 @@ REFUSED: dict[str, tuple[str | bytes, dict, list[str]]] = {
         {},
         ["line 2", "9 units for 10 columns", "write - where there is none"],
     ),
+    "a header only": (HEAD, {}, ["rows: expected at least one row of numbers, got a header only"]),
     "strange sep": ("sep=#\n" + HEAD + ROW, {}, ["first line", "sep=#", "semicolon"]),
     "comments only": ("# nothing\n", {}, ["comments only"]),
     "YAML by name": ("a: 1\n", {"name": "plan.yaml"}, ["a YAML file", "give the measured table"]),
@@ -319,3 +320,51 @@ def test_no_byte_of_another_kind_of_file_brings_a_traceback(tmp_path: Path, kind
             assert "\n" not in str(error) and len(str(error)) < 2500
             refused += 1
     assert refused > 3
+
+
+def test_rows_of_separators_only_and_cells_beyond_the_names_are_nothing(tmp_path: Path) -> None:
+    """As spreadsheet programs write them below and beside a table."""
+    path = tmp_path / "data.csv"
+    path.write_text(HEAD + ROW + ",,\n" + ROW + ",,,,,,,,\n")
+    np.testing.assert_array_equal(read_data(path, ROBOT).data.q, [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]] * 2)
+    path.write_text(ROW.replace("\n", ",,\n") * 2)
+    names = ("j1", "j2", "j3", "j4", "j5", "j6", "x1", "y1", "z1")
+    data = read_data(path, ROBOT, Reading(columns=names, units=Units("m", "rad"))).data
+    np.testing.assert_array_equal(data.p[:, 0], [[1.5, 0.25, 1e-3]] * 2)
+
+
+def test_numbers_of_rows_without_a_heading_are_no_joint(tmp_path: Path) -> None:
+    """As R writes them between white space."""
+    path = tmp_path / "data.txt"
+    rows = [f"{k} {ROW}".replace(",", " ") for k in (1, 2)]
+    path.write_text(HEAD.replace(",", " ") + "".join(rows))
+    np.testing.assert_array_equal(read_data(path, ROBOT).data.q, [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]] * 2)
+
+
+def test_joints_may_have_units_of_their_own_which_is_said(tmp_path: Path) -> None:
+    said: list[str] = []
+    path = tmp_path / "data.csv"
+    path.write_text(HEAD.replace("j1", "j1 [deg]").replace("j2", "j2 [rad]") + ROW)
+    source = read_data(path, ROBOT, Reading(note=said.append))
+    assert source.data.q[0, :2].tolist() == [np.deg2rad(0.1), 0.2]
+    assert "joints in deg, rad" in said[0]
+
+
+def test_the_sheet_with_the_table_is_the_one_with_numbers(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.title = "notes"
+    path = tmp_path / "data.xlsx"
+    book.save(path)
+    with pytest.raises(FileFormatError, match="sheets: expected a sheet with numbers, got notes; fill one"):
+        read_data(path, ROBOT)
+    for name in ("monday", "tuesday"):
+        sheet = book.create_sheet(name)
+        for line in (HEAD, ROW):
+            cells = line.strip().split(",")
+            sheet.append(cells if line is HEAD else list(map(float, cells)))
+        book.save(path)
+        if name == "monday":
+            assert read_data(path, ROBOT).data.q.tolist() == [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]]
+    with pytest.raises(FileFormatError, match="monday, tuesday alike; delete the others, or save one as CSV"):
+        read_data(path, ROBOT)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from robots import mixed, random_configurations
 
 from calib_planner import FileFormatError, IdentificationProblem, Robot, identify
@@ -168,3 +169,8 @@ def test_estimates_that_do_not_fit(before: tuple[Path, Any], tmp_path: Path) -> 
     text = path.read_text().splitlines()
     with pytest.raises(FileFormatError, match=r"robot: expected .*no key 'robot'"):
         read_prior(write(tmp_path, text[0]), mixed().with_parameters(["turn.x"]))
+    document = yaml.safe_load(path.read_text())
+    for row in document["parameters"]:
+        row["std"] = None
+    with pytest.raises(FileFormatError, match="an estimate that knows how sure it is"):
+        read_prior(write(tmp_path, yaml.safe_dump(document)), mixed().with_parameters(["turn.x"]))

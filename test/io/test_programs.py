@@ -302,6 +302,15 @@ def test_signs_zeros_and_coupling() -> None:
     np.testing.assert_array_equal(alone, sheet.plan.configurations)
 
 
+def test_two_joints_have_no_third_that_could_be_coupled() -> None:
+    robot = Robot.load("planar_2r")
+    sheet, form = plan_sheet(plan_of(robot, np.zeros((2, 2))), robot), read_program_format("urscript")
+    form = replace(form, joints=None)
+    assert controller_axes(sheet, form, ProgramSettings(coupling=0)).shape == (2, 2)
+    with pytest.raises(InputError, match="coupling: expected 0 for a robot of 2 joints"):
+        controller_axes(sheet, form, ProgramSettings(coupling=1.0))
+
+
 def test_a_robot_that_shows_its_coupling_is_not_coupled_again() -> None:
     coupled = KUKA.with_couplings([parse_coupling("joint_a3-=joint_a2")])
     sheet, form = kuka_sheet(coupled), read_program_format("fanuc")

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from calib_planner import InputError
-from calib_planner.io import fresh_folder, write_text
+from calib_planner import FileFormatError, InputError
+from calib_planner.io import check_writable, fresh_folder, write_text
+from calib_planner.io.text import decode_any
 
 
 def test_replaces_and_keeps_permissions(tmp_path: Path) -> None:
@@ -53,6 +54,7 @@ def test_unwritable_paths_name_the_option(tmp_path: Path, name: str) -> None:
 
 
 def test_devices_are_written_to(tmp_path: Path) -> None:
+    check_writable(os.devnull)
     write_text(os.devnull, "x")
     assert not Path(os.devnull).is_file()
 
@@ -67,3 +69,11 @@ def test_a_fresh_folder_never_holds_earlier_results(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="out"):
         fresh_folder(tmp_path / "file", "out")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_a_nul_is_no_character_of_a_text(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "points.csv"
+    path.write_bytes("q1,q2,x,y,z\n1,2,\0,4,5\n".encode(encoding))
+    with pytest.raises(FileFormatError, match="line 2: expected a table, got a NUL character; save it as text"):
+        decode_any(path, "a table", path.read_bytes())

@@ -14,6 +14,7 @@ from robots import mixed, random_configurations
 from calib_planner import FileFormatError, InputError, Robot, UnknownNameError
 from calib_planner.io import shipped_robots
 from calib_planner.robot import Element, LinkMass, joint_origins, with_origins
+from calib_planner.robot.chain import MOST_PROGRAMS
 from calib_planner.robot.elements import rotation
 
 
@@ -122,6 +123,23 @@ def test_fixed_joints_place_the_tip_of_a_urdf_and_no_other_pose():
     np.testing.assert_allclose(with_origins(robot, origins.joints).positions(q), robot.positions(q), atol=1e-14)
 
 
+def test_a_robot_remembers_few_programs_and_is_right_all_the_same():
+    """Every set of parameters that deviate is a program of its own."""
+    robot = Robot.load("planar_2r").with_parameters("full")
+    count = min(len(robot.parameter_names), 7)
+    q, nominal = random_configurations(robot, 2), robot.positions(random_configurations(robot, 2))
+    for mask in range(2**count - 1, -1, -1):
+        wrong = np.zeros(len(robot.parameter_names))
+        wrong[:count] = [1e-3 * bool(mask >> k & 1) for k in range(count)]
+        moved = robot.with_deviations(dict(zip(robot.parameter_names, wrong, strict=True)))
+        if mask % 16 == 0:
+            np.testing.assert_allclose(robot.positions(q, wrong), moved.positions(q), atol=1e-15)
+        else:
+            robot.positions(q, wrong)
+    assert 1 < len(robot._programs) <= MOST_PROGRAMS
+    np.testing.assert_array_equal(robot.positions(q), nominal)
+
+
 def test_unknown_robot():
     with pytest.raises(UnknownNameError, match="kuka_kr270"):
         Robot.load("kuka_kr27")
@@ -151,6 +169,9 @@ YAML_HEAD = "joints: [{name: q1, lower: -1, upper: 1}]\nelements: [{type: Rz, jo
         (YAML_HEAD.replace("upper: 1", "upper: 1, unit: turn"), "rad, deg"),
         (YAML_HEAD + "targets: [[1, 2]]", "a list of 3 numbers"),
         (YAML_HEAD + "lengths: [l9]", "only: "),
+        (YAML_HEAD + "lengths: l1", "a list of parameter names"),
+        (YAML_HEAD + "name: [arm]", "a name"),
+        (YAML_HEAD.replace("name: q1", "name: true"), "a name"),
         (YAML_HEAD.replace("elements: [", "elements: [{type: Rx, joint: q1}, "), "exactly one element"),
         ("!!python/object/apply:os.system ['true']", "readable YAML"),
     ],
