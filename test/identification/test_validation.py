@@ -10,9 +10,19 @@ import numpy as np
 import pytest
 from cells import SIGMA, WrongRobot, bare, placed_cell, plain_cell, spoil
 from robots import random_configurations, repeats
+from scipy.stats import chi2
 
-from calib_planner import IdentificationProblem, InputError, Measurements, NotEnoughDataError, identify, validate
-from calib_planner.error_model import ErrorModel
+from calib_planner import (
+    IdentificationProblem,
+    InputError,
+    Measurements,
+    NotEnoughDataError,
+    Robot,
+    identify,
+    validate,
+)
+from calib_planner.error_model import ErrorModel, JointFunctions, Knowledge, typical
+from calib_planner.identification.validation import _Prediction, _squared_trace, _statistics, normalised
 from calib_planner.simulation import SimulatedCell
 
 
@@ -177,3 +187,68 @@ def test_refusals():
         validate(problem, estimate, [bare(fresh, np.full(fresh.p.shape, np.nan))])
     with pytest.raises(InputError, match="targets"):
         validate(problem, estimate, [bare(fresh, np.repeat(fresh.p, 2, axis=1))])
+
+
+def test_what_all_points_share_is_in_the_trace_of_their_covariance() -> None:
+    """tr S² with S of all measured coordinates written out; points that were not seen have no part in it."""
+    robot = Robot.load("ur10e").with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05]])
+    robot = robot.with_parameters("full", ("base", "tool"))
+    model = replace(typical(), joint_functions=JointFunctions(harmonics=4))
+    known = Knowledge.of_plan(robot, model, random_configurations(robot, 20, 1))
+    q = random_configurations(robot, 4, 2)
+    points = robot.positions(q).copy()
+    points[1, 0] = points[3] = np.nan
+    data = Measurements(robot.joint_names, q, points)
+    poses = known.poses(q)
+    rows = known.model.columns(poses).reshape(24, -1)
+    whole = rows @ known.covariance @ rows.T
+    for visit, own in enumerate(known.model.visit_covariance(poses)):
+        whole[6 * visit : 6 * visit + 6, 6 * visit : 6 * visit + 6] += own
+    use = np.flatnonzero(np.repeat(data.seen.ravel(), 3))
+    assert _squared_trace(known, data) == pytest.approx(np.sum(whole[np.ix_(use, use)] ** 2), rel=1e-6)
+    alone = Measurements(robot.joint_names, q, points[:, :1])  # of one target where two are known
+    use = np.flatnonzero(np.repeat(np.stack([data.seen[:, 0], np.zeros(4, bool)], axis=1).ravel(), 3))
+    assert _squared_trace(known, alone) == pytest.approx(np.sum(whole[np.ix_(use, use)] ** 2), rel=1e-6)
+
+
+def test_mahalanobis_lengths_and_how_many_are_inside() -> None:
+    rng = np.random.default_rng(0)
+    half, residuals = rng.normal(size=(5, 2, 3, 3)), rng.normal(size=(5, 2, 3))
+    covariance = half @ np.swapaxes(half, 2, 3) + np.eye(3)
+    residuals[3, 1] = np.nan
+    got = normalised(residuals, covariance)
+    assert np.isnan(got[3, 1]) and np.isnan(got).sum() == 1
+    for place in np.argwhere(np.isfinite(got)):
+        error = residuals[tuple(place)]
+        expected = np.sqrt(error @ np.linalg.solve(covariance[tuple(place)], error))
+        assert got[tuple(place)] == pytest.approx(expected, rel=1e-9)
+    lengths = np.linalg.norm(residuals, axis=2)[:3].ravel()
+    parts = [
+        _Prediction(
+            residuals[k],
+            covariance[k],
+            np.full((2, 3), 0.25),
+            np.array([1.0, 2.0]),
+            np.array([3.0, 5.0]),
+            float(k + 1),
+        )
+        for k in range(3)
+    ]
+    told = _statistics(parts)
+    traces = np.trace(covariance[:3], axis1=2, axis2=3).ravel()
+    expected = {
+        "count": 6,
+        "mean": lengths.mean(),
+        "median": np.median(lengths),
+        "rms": np.sqrt(np.mean(lengths**2)),
+        "max": lengths.max(),
+        "before_mean": 4.0,
+        "predicted_rms": np.sqrt(traces.mean()),
+        "within_95": np.mean(got[:3] <= np.sqrt(chi2.ppf(0.95, 3))),
+        "placement_mean": 1.5,
+        "placement_rms": np.sqrt(2.5),
+        "noise_rms": np.sqrt(0.75),
+        "freedom": traces.sum() ** 2 / 6.0,
+    }
+    for name, value in expected.items():
+        assert getattr(told, name) == pytest.approx(value, rel=1e-9), name
