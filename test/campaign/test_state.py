@@ -24,8 +24,11 @@ from calib_planner.campaign import (
     begin,
     decide,
     from_measurements,
+    run_campaign,
 )
+from calib_planner.campaign.assess import expected
 from calib_planner.campaign.problem import WIDEST, AwayFrom, joint_scale, radius_of
+from calib_planner.error_model import Prior
 from calib_planner.simulation import simulated
 
 PROBLEM = planar()
@@ -282,3 +285,14 @@ def test_a_joint_that_moves_nothing_is_no_way_out():
     turned[5] += 2.0
     out = AwayFrom((Exclusion(0, q, 0.05, ""),), scale)
     assert not out.allowed(robot, turned[None])[0]
+
+
+def test_a_paused_campaign_waits_for_somebody_to_resume_it(planned):
+    with pytest.raises(InputError, match=r"state: expected a campaign that runs, got paused; use state\.resume"):
+        run_campaign(planned.pause(), lambda _: POINTS[0])
+
+
+def test_a_stated_prior_is_part_of_what_is_expected():
+    prior = Prior(PROBLEM.robot.parameter_names[:1], [0.0], [1e-4])
+    told = expected(dataclasses.replace(PROBLEM, identification={**PROBLEM.identification, "prior": prior}))
+    assert told.placement.stated is prior and expected(PROBLEM).placement.stated is None

@@ -74,3 +74,12 @@ def test_a_weight_is_as_good_as_so_many_measurements(base: bool, tool: bool, pla
     want = place(robot, many, tip_poses(robot, many.q, at_base=base), base=base, tool=tool)
     for name in ("rotation", "origin", "offsets"):
         np.testing.assert_allclose(getattr(got, name), getattr(want, name), atol=1e-8)
+
+
+def test_points_that_fit_exactly_are_all_believed() -> None:
+    """Nothing to weigh: the median distance is zero."""
+    robot = Robot.load("planar_2r").with_targets([[0.0, 0.0, 0.0]])
+    q = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    points = robot.positions(q)
+    put = register(robot, Measurements(robot.joint_names, q, points), base=False, tool=True, robust=True)
+    np.testing.assert_array_equal(put.positions(q), points)

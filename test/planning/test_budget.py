@@ -14,6 +14,7 @@ from robots import random_configurations, repeats
 from calib_planner import InfeasibleError, InputError, PlanProblem, Robot, plan
 from calib_planner.error_model import Prior, typical
 from calib_planner.planning import (
+    Candidates,
     Pace,
     Search,
     budget,
@@ -247,3 +248,31 @@ def test_a_time_that_is_too_short_says_what_is_needed():
         plan_for_time(problem(compound={"d": 0.3}), SLOW, 200.0)
     with pytest.raises(InputError, match="time_budget"):
         plan_for_time(problem(), SLOW, -1.0)
+
+
+def test_random_plans_are_of_accuracies_only():
+    with pytest.raises(InputError, match="criterion: expected test_pose, got d"):
+        compare(problem(criterion="d"), [(4, 1)], 10)
+    with pytest.raises(InputError, match="criterion"):
+        compare(problem(compound={"d": 0.3}), [(4, 1)], 10)
+
+
+def test_a_time_is_not_filled_with_candidates_twice():
+    """Six candidates that may be measured once each: no plan has more, however much time there is."""
+    candidates = Candidates(random_configurations(Robot.load("planar_2r"), 6, 3))
+    found = plan_for_time(two_link(candidates=candidates), Pace(np.full(2, 1.0)), 3600.0)
+    assert max(len(p.configurations) for p in found.tried) <= 6
+    rows = {tuple(q) for q in np.asarray(candidates.configurations)}
+    assert {tuple(q) for q in found.plan.configurations} <= rows
+
+
+def test_a_cancelled_search_for_a_time_gives_the_best_plan_so_far():
+    asked = []
+
+    def cancel(progress):
+        asked.append(progress)
+        return True
+
+    found = plan_for_time(two_link(), Pace(np.full(2, 1.0)), 600.0, callback=cancel)
+    assert len(found.tried) == 1 and found.plan.quality.status == "cancelled"
+    assert sum(found.plan.repetitions) > 0 and asked

@@ -13,7 +13,7 @@ import pytest
 from robots import mixed, random_configurations
 
 from calib_planner import InfeasibleError, InputError, Measurements, PlanProblem, Robot, UnknownNameError, plan
-from calib_planner.planning import Candidates, Search, visiting_order
+from calib_planner.planning import Candidates, Search, tour, visiting_order
 from calib_planner.planning.search.descent import descend
 
 TEST_POSE = np.radians([0.0, -60.0, 90.0, 0.0, 45.0, 0.0])
@@ -135,6 +135,21 @@ def test_visiting_order_shortens_travel():
         return np.abs(np.diff(rows / scale, axis=0)).max(axis=1).sum()
 
     assert travel(ordered) < 0.8 * travel(q)
+
+
+def test_a_very_long_tour_goes_to_the_nearest_place_that_is_left(monkeypatch):
+    """Of more configurations than ``LARGE`` no stretch is turned round: that takes their square."""
+    robot, q = kuka(), random_configurations(kuka(), 12)
+    short = visiting_order(q, robot)
+    monkeypatch.setattr(tour, "LARGE", 5)
+    order = visiting_order(q, robot)
+    assert sorted(order) == sorted(short) == list(range(12))
+    scale = np.diff(robot.joint_limits, axis=1)[:, 0]
+    here, left = robot.joint_limits.mean(axis=1), set(range(12))
+    for row in order:
+        ways = {k: (np.abs(q[k] - here) / scale).max() for k in left}
+        assert ways[row] == min(ways.values())
+        here, left = q[row], left - {row}
 
 
 @pytest.mark.parametrize(

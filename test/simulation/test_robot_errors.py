@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_planner import Robot
+from calib_planner import InputError, Robot
 from calib_planner.campaign import Measure
 from calib_planner.error_model import ErrorModel, typical
 from calib_planner.simulation import (
@@ -23,6 +23,7 @@ from calib_planner.simulation import (
     random_deviations,
     simulated,
 )
+from calib_planner.tracker import LaserTracker
 
 ROBOT = Robot.load("kuka_kr270").with_targets([[0.1, 0.02, 0.3], [-0.05, 0.2, 0.1]])
 DEVIATIONS = {"d1": 1e-3, "q2": -5e-4}
@@ -132,3 +133,21 @@ def test_the_trackers_noise_is_the_cells() -> None:
     data = cell.measure(np.repeat(Q, 50, axis=0), 1, 1)
     error = data.p - cell.truth.positions(data.q)
     assert error.std() == pytest.approx(2e-5, rel=0.1) and np.all(np.asarray(data.std) == 2e-5)
+
+
+def test_repetitions_are_one_number_or_one_of_each_configuration() -> None:
+    cell = SimulatedCell(ROBOT, {}, 2e-5)
+    data = cell.measure(Q[:3], [2, 1, 3], 1)
+    np.testing.assert_array_equal(data.q, np.repeat(Q[:3], [2, 1, 3], axis=0))
+    with pytest.raises(InputError, match="repetitions: expected one number or 3 numbers, got"):
+        cell.measure(Q[:3], [2, 1], 1)
+
+
+def test_a_trackers_standard_deviations_are_those_of_its_covariance() -> None:
+    tracker = LaserTracker(station=np.array([4.0, 0.0, 1.0]))
+    cell = SimulatedCell(ROBOT, {}, instrument=tracker)
+    data = cell.measure(Q[:3], 1, 1)
+    expected = np.sqrt(np.diagonal(tracker.covariance(cell.truth.positions(data.q)), axis1=-2, axis2=-1))
+    np.testing.assert_allclose(
+        np.asarray(data.std), expected, rtol=1e-3
+    )  # at the points with their visits' errors
