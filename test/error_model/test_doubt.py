@@ -42,7 +42,7 @@ def test_a_points_square_is_its_left_out_residual_under_its_covariance_without_d
     for visit, target in np.argwhere(seen):
         at = slice(3 * target, 3 * target + 3)
         without = problem.covariance[visit, at, at] - doubt[visit, target] * np.eye(3)
-        assert own[visit, target] == pytest.approx(np.trace(without) / 3.0, rel=1e-9)
+        assert own[visit, target] == pytest.approx(np.trace(without) / 3.0, rel=1e-9, abs=0.0)
         total = left.covariance[visit, at, at] - doubt[visit, target] * np.eye(3)
         total += 1e-3 * own[visit, target] * np.eye(3)
         error = left.residuals[visit, target]

@@ -193,7 +193,9 @@ def test_a_scale_stays_within_its_bounds() -> None:
     """Between 0.005 and 300 times its median; a thousand million times where nothing is known of it."""
     model = replace(ErrorModel.paper(), scales=(replace(ErrorModel.paper().scales[0], value=2e-5, median=1e-4),))
     for step, share in ((np.log(3.0), 0.6), (-60.0, 1e-9), (60.0, 1e9)):
-        assert _moved(model, ("floor",), np.array([step])).values["floor"] == pytest.approx(1e-4 * share)
+        assert _moved(model, ("floor",), np.array([step])).values["floor"] == pytest.approx(
+            1e-4 * share, rel=1e-9, abs=0.0
+        )
     known = typical()
     median = {s.name: s.median for s in known.scales}["gravity"]
     for step, share in ((-60.0, 5e-3), (60.0, 300.0)):
@@ -325,7 +327,7 @@ def test_what_left_out_residuals_tell_is_what_their_covariances_say() -> None:
         variances += list(np.diag(covariance)[counted].reshape(-1, 3).sum(axis=1))
         left = np.trace(own @ precision) / measured.sum()
         expected = 2.0 * np.sum(covariance[np.ix_(counted, counted)] ** 2) * (2.0 - left)
-        assert found.spread[group] == pytest.approx(expected, rel=1e-5)
+        assert found.spread[group] == pytest.approx(expected, rel=1e-5, abs=0.0)
         spread += expected
         square = residual @ precision @ residual
         assert found.squares[group] == pytest.approx(square, rel=1e-6)

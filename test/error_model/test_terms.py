@@ -25,7 +25,7 @@ from calib_planner.error_model import (
     Visits,
     typical,
 )
-from calib_planner.error_model.gravity import downwards
+from calib_planner.error_model.gravity import LINKS, downwards
 from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
@@ -194,6 +194,29 @@ def test_masses_stand_at_elbow_wrist_and_tip() -> None:
     names = [m.name for m in Gravity().masses_of(Robot.load("ur10e"))]
     assert names == ["elbow", "wrist", "tip"]
     assert [m.name for m in Gravity().masses_of(Robot.load("planar_2r"))] == ["tip"]
+
+
+def test_a_robot_of_one_joint_carries_a_mass_at_its_tip() -> None:
+    elements = (Element("Rz", joint=0), Element("Tx", 0.4, parameter="arm"))
+    robot = Robot("one", elements, (), ("a",), np.array([[-1.0, 1.0]])).with_targets([[0.0, 0.1, 0.2]])
+    assert Gravity().masses_of(robot) == (Mass("tip"),)
+
+
+def test_every_coefficient_of_gravity_acts_at_the_joint_of_its_name(robot: Robot) -> None:
+    for gravity in (Gravity(), Gravity((Mass("arm", 1), Mass("hand")), payload=Payload(5.0))):
+        names = gravity.names(robot)
+        joints = [robot.joint_names[j] for j in gravity.joints(robot)]
+        assert len(names) == len(joints) == gravity.size(robot)
+        assert all(name.endswith(f".{joint}") for name, joint in zip(names, joints, strict=True))
+
+
+def test_a_payload_goes_before_the_tip_of_known_links_and_before_nothing_else() -> None:
+    known = Gravity((Mass(LINKS, 1), Mass("tip"), Mass("wrist", 2)))
+    with_one = known.with_payload(Payload(5.0))
+    assert [mass.name for mass in with_one.masses] == [LINKS, "wrist"]
+    assert [mass.name for mass in with_one.with_payload(None).masses] == [LINKS, "wrist", "tip"]
+    stated = Gravity((Mass("tip"), Mass("wrist", 2))).with_payload(Payload(5.0))
+    assert [mass.name for mass in stated.masses] == ["tip", "wrist"]
 
 
 def test_the_mounting_is_found_from_the_trackers_vertical() -> None:

@@ -205,10 +205,10 @@ def test_what_all_points_share_is_in_the_trace_of_their_covariance() -> None:
     for visit, own in enumerate(known.model.visit_covariance(poses)):
         whole[6 * visit : 6 * visit + 6, 6 * visit : 6 * visit + 6] += own
     use = np.flatnonzero(np.repeat(data.seen.ravel(), 3))
-    assert _squared_trace(known, data) == pytest.approx(np.sum(whole[np.ix_(use, use)] ** 2), rel=1e-6)
+    assert _squared_trace(known, data) == pytest.approx(np.sum(whole[np.ix_(use, use)] ** 2), rel=1e-6, abs=0.0)
     alone = Measurements(robot.joint_names, q, points[:, :1])  # of one target where two are known
     use = np.flatnonzero(np.repeat(np.stack([data.seen[:, 0], np.zeros(4, bool)], axis=1).ravel(), 3))
-    assert _squared_trace(known, alone) == pytest.approx(np.sum(whole[np.ix_(use, use)] ** 2), rel=1e-6)
+    assert _squared_trace(known, alone) == pytest.approx(np.sum(whole[np.ix_(use, use)] ** 2), rel=1e-6, abs=0.0)
 
 
 def test_mahalanobis_lengths_and_how_many_are_inside() -> None:

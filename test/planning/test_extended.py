@@ -404,7 +404,7 @@ def test_a_robot_that_errs_more_or_less_is_another_problem(factor: float) -> Non
     same(spread.test_floor, whole.test_floor)
     same(spread.general * np.outer(turn, turn), whole.general)
     same(spread.prior * np.outer(turn, turn), whole.prior)
-    assert spread.general_floor == pytest.approx(whole.general_floor, rel=1e-6)
+    assert spread.general_floor == pytest.approx(whole.general_floor, rel=1e-6, abs=0.0)
     for one, other in ((spread.model, whole.model), (spread.single, whole.single)):
         same(one.totals(q, 6)[0] * np.outer(turn, turn), other.totals(q, 6)[0])
 
