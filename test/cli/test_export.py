@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shutil
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -161,6 +163,17 @@ def test_targets_are_corrected_as_compensate_does(
     )
 
 
+def test_what_was_corrected_is_shown_to_people(
+    made: Path, saved: SavedEstimate, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = saved.nominal_robot()
+    write_configurations(tmp_path / "q.csv", robot.joint_names, random_configurations(robot, 3, 1) / 2.0)
+    assert main(["export", f"{made}/estimate.yaml", "--targets", f"{tmp_path}/q.csv", f"{tmp_path}/c.csv"]) == 0
+    out, err = capsys.readouterr()
+    assert f"targets written to {tmp_path}/c.csv" in out
+    assert "3 targets, 0 reached" in err  # four joints cannot keep the orientation, too
+
+
 def test_shown_without_options(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(made / "estimate.yaml")]) == 0
     out = capsys.readouterr().out
@@ -213,6 +226,7 @@ def test_what_is_refused(
 
 
 ROBOT = {"source": "x.urdf", "links": ["base", "tip"]}
+CUT_SHORT = base64.b64encode(zlib.compress(MIXED_URDF.encode())[:-20]).decode()
 DATA = {"visits": 2, "targets": 2, "configurations": packed(np.zeros((2, 4))), "points": packed(np.zeros(12))}
 
 
@@ -224,6 +238,7 @@ DATA = {"visits": 2, "targets": 2, "configurations": packed(np.zeros((2, 4))), "
         ({"measurements": DATA | {"configurations": packed(np.full(8, np.nan))}}, "configurations"),
         ({"measurements": DATA}, "residuals"),
         ({"robot": ROBOT | {"text": "AAAA"}}, "compressed text"),
+        ({"robot": ROBOT | {"text": CUT_SHORT}}, "compressed text"),
         ({"robot": ROBOT}, "--robot"),
         ({"test_poses": "north"}, "problem"),
         ({"loss": "square"}, "loss"),

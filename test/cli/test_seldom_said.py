@@ -6,21 +6,30 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import random_configurations
+from rich.console import Console
+from robots import MIXED_URDF, mixed, random_configurations
 
-from calib_planner import PlanProblem, Robot, plan
-from calib_planner.cli import main
+from calib_planner import CalibPlannerError, PlanProblem, Robot, plan
+from calib_planner.campaign import CampaignProblem, CampaignResult
+from calib_planner.cli import main, parser
 from calib_planner.cli.arguments import column_names
+from calib_planner.cli.campaign import _write as write_campaign
+from calib_planner.cli.campaign import show_result
+from calib_planner.error_model import typical
+from calib_planner.identification import Reason, Verdict
 from calib_planner.io import write_measurements, write_plan
 from calib_planner.planning import Search
 from calib_planner.simulation import SimulatedCell
 
 PLANAR = ("plan", "--robot", "planar_2r", "--starts", "1")
 POSE = ("--test-pose", "0.3 0.8")
+PROBLEM = CampaignProblem(Robot.load("planar_2r"), [0.2, 0.9], 1e-5)
 
 
 @pytest.fixture
@@ -152,6 +161,42 @@ def test_more_reflectors_than_the_robot_has_are_placed_or_refused(
     assert "2 targets" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
+def test_the_frame_of_an_accuracy_and_the_share_of_placement_are_shown(shown, tmp_path: Path) -> None:
+    """With all terms of the error model every set of points has a row of placement alone beside it."""
+    robot = mixed()
+    cell = SimulatedCell(robot, {"turn.x": 1e-3}, 2e-5, error_model=typical(), seed=1)
+    urdf, points, held_out = (tmp_path / name for name in ("mixed.urdf", "points.csv", "test.csv"))
+    urdf.write_text(MIXED_URDF)
+    write_measurements(points, cell.measure(random_configurations(robot, 25, 1), 1, 1))
+    write_measurements(held_out, cell.measure(random_configurations(robot, 5, 2), 1, 2))
+    poses = [" ".join(map(repr, q.tolist())) for q in random_configurations(robot, 4, 3)]
+    words = ["identify", "--robot", str(urdf), "--targets", "0.1 0.02 0.3", "--targets", "-0.05 0.2 0.1"]
+    words += ["--data", str(points), "--validate", str(held_out), "--accuracy-frame", "robot"]
+    words += ["--parameters", "offsets"]
+    text = shown(*words, *(word for pose in poses for word in ("--test-pose", pose)))
+    assert "up to a new registration of the robot" in text and "with placement alone:" in text
+    assert text.count("… placement alone") == 3 and "held out" in text
+
+
+# ── campaigns ────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_campaign_that_identified_nothing_says_so(tmp_path: Path) -> None:
+    reason = Reason("FAIL", "no_estimate", "nothing was identified", "measure more")
+    ended = ("failed", "Nothing to be seen", 1e-4, (), None, Verdict("FAIL", (reason,)), None, None, (), 3, 40)
+    result = CampaignResult(*ended)
+    console = Console(file=StringIO(), width=300)
+    show_result(result, np.array([2e-3]), console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert text.startswith("FAIL: failed") and "nothing was identified → measure more" in text
+    assert "True error at the test poses: 2.00 mm on average over visits; nothing predicted, unlimited" in text
+    assert "3 of 40 measurements spent, 0 configurations given up." in text and "Validation" not in text
+    show_result(result, None, console)
+    assert console.file.getvalue().count("True error") == 1  # type: ignore[attr-defined]
+    write_campaign(tmp_path, PROBLEM, result)
+    assert list(tmp_path.iterdir()) == []
+
+
 # ── errors that are nobody's ─────────────────────────────────────────────────────────────────────────
 
 
@@ -166,6 +211,19 @@ def test_what_the_machine_refuses_is_one_line(
     assert main(["robots", "list"]) == 1
     told = capsys.readouterr().err
     assert (str(error) or type(error).__name__) in told and told.count("\n") == 1
+
+
+def test_a_package_that_is_missing_is_named_unless_it_is_the_papers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(module: str) -> None:
+        raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)
+
+    monkeypatch.setattr(sys.modules["calib_planner.cli.main"], "import_module", fail)
+    missing = "scipy"
+    with pytest.raises(ModuleNotFoundError, match="scipy"):
+        parser("plan")
+    missing = "calib_planner_paper"
+    with pytest.raises(CalibPlannerError, match="paper"):
+        parser("reproduce")
 
 
 def test_a_mistake_of_the_program_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
