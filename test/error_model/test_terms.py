@@ -293,6 +293,30 @@ def test_visits_and_points_have_the_covariance_of_what_they_stand_for(robot: Rob
     np.testing.assert_allclose(np.cov(error.T), expected, atol=0.02 * np.abs(expected).max())
 
 
+def test_a_shift_that_targets_share_needs_two_of_them() -> None:
+    """Of one target nothing tells it from the noise of the point. Either is drawn as if the other were there."""
+    values = {"repeatability": 1e-4, "shared": 3e-5}
+    draws = {}
+    for count in (1, 2):
+        robot = Robot.load("ur10e").with_targets([[0.0, 0.05, 0.1], [0.08, -0.03, 0.05]][:count])
+        for joints, shared in ((True, True), (False, True), (True, False)):
+            term = Visits(joints, shared)
+            draws[joints, shared, count] = term.draw(robot, values, 400, np.random.default_rng(0))
+            parts = term.parts(Poses(robot, random_configurations(robot, 2)), values)
+            assert set(parts) == ({"repeatability"} if joints else set()) | (
+                {"shared"} if shared and count == 2 else set()
+            )
+    turned, moved = draws[True, True, 2]
+    assert moved.shape == (400, 2, 3) and turned.shape == (400, 6)
+    assert np.std(turned) == pytest.approx(1e-4, rel=0.1) and np.std(moved) == pytest.approx(3e-5, rel=0.1)
+    np.testing.assert_array_equal(moved[:, 0], moved[:, 1])
+    for joints, shared in ((False, True), (True, False)):
+        other, away = draws[joints, shared, 2]
+        np.testing.assert_array_equal(other, turned * joints)
+        np.testing.assert_array_equal(away, moved * shared)
+    assert not draws[True, True, 1][1].any()
+
+
 def test_what_came_with_the_data_goes_before_the_instrument() -> None:
     robot = Robot.load("ur10e")
     poses = Poses(robot, random_configurations(robot, 2))
