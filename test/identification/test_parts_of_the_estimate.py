@@ -1,0 +1,145 @@
+# Copyright 2026 calib_planner contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Small parts of the answer of an identification, each against its definition."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import random_configurations
+
+from calib_planner import IdentificationProblem, Measurements, Robot
+from calib_planner.error_model import ErrorModel, JointFunctions, Knowledge, typical
+from calib_planner.identification.rejection import copied_rows, explain, rejected_since
+from calib_planner.identification.solver import _blind_poses, _hardly_seen, _variances, _with_fixed
+
+SIGMA = 3e-5
+
+
+def kuka(parameters: str) -> Robot:
+    return Robot.load("kuka_kr270").with_targets([[0.0, 0.1, 0.05]]).with_parameters(parameters)
+
+
+@pytest.mark.parametrize(("apart", "told"), [(1e-3, ("1·a - 0.5·c",)), (5e-2, ())])
+def test_a_combination_is_hardly_seen_if_unit_columns_almost_cancel(apart: float, told: tuple[str, ...]) -> None:
+    """Columns 2·a and c of a design are alike but for ``apart``; d is fixed and has no part."""
+    rng = np.random.default_rng(0)
+    columns = rng.normal(size=(30, 3))
+    columns[:, 2] = 2.0 * columns[:, 0] + 2.0 * apart * columns[:, 2]
+    covariance = np.zeros((4, 4))
+    covariance[np.ix_([0, 1, 2], [0, 1, 2])] = 1e-8 * np.linalg.inv(columns.T @ columns)
+    names = ("a", "b", "c", "d")
+    got = _hardly_seen(names, covariance, (3,))
+    assert got == told  # the larger change stands first
+    assert _hardly_seen(names, covariance, (0, 1, 2, 3)) == ()
+
+
+def test_a_parameter_that_was_fixed_is_at_its_nominal_value_without_doubt() -> None:
+    robot = kuka("d1,q2,d2,q3")
+    model = replace(typical(), joint_functions=JointFunctions(("smooth",), 3))
+    few = replace(robot, parameter_names=("d1", "q3"))
+    names, rng = model.names(few), np.random.default_rng(0)
+    half, hidden = rng.normal(size=(len(names), len(names))), rng.normal(size=(len(names), 2))
+    known = Knowledge(few, model, rng.normal(size=len(names)), half @ half.T, hidden)
+    whole = _with_fixed(known, robot.parameter_names)
+    every = list(model.names(robot))
+    at = [every.index(name) for name in names]
+    rest = [k for k in range(len(every)) if k not in at]
+    assert {every[k] for k in rest} == {"q2", "d2"}
+    np.testing.assert_array_equal(whole.coefficients[at], known.coefficients)
+    np.testing.assert_array_equal(whole.covariance[np.ix_(at, at)], known.covariance)
+    np.testing.assert_array_equal(whole.hidden[at], hidden)
+    assert (
+        not whole.coefficients[rest].any() and not whole.covariance[rest].any() and not whole.hidden[rest].any()
+    )
+    assert not whole.covariance[:, rest].any()
+    assert _with_fixed(whole, robot.parameter_names) is whole
+
+
+def test_a_test_pose_is_blind_if_it_feels_what_no_point_shows() -> None:
+    """Far more, ten times, than any point that was measured, and more than rounding."""
+    robot = kuka("d1,q2,q5")
+    low, high = robot.joint_limits.T
+    q = np.tile(low + 0.4 * (high - low), (4, 1))
+    q[:, 0] += [0.0, 0.1, 0.2, 0.3]
+    poses = np.vstack([q[0], random_configurations(robot, 2, 3)])
+    points = robot.positions(q).copy()
+    points[3] = np.nan
+    problem = IdentificationProblem(
+        robot, Measurements(robot.joint_names, q, points), SIGMA, ErrorModel.paper(), test_poses=poses
+    )
+    rng = np.random.default_rng(0)
+    for scale in (1.0, 1e-8):
+        directions = scale * rng.normal(size=(2, 3))
+        seen = np.linalg.norm(np.einsum("nij,kj->nki", robot.jacobian(q[:3]), directions), axis=2).max(axis=0)
+        felt = np.linalg.norm(np.einsum("nij,kj->nki", robot.jacobian(poses), directions), axis=2)
+        expected = (felt > 10.0 * seen + 1e-5).any(axis=1)
+        np.testing.assert_array_equal(_blind_poses(problem, robot, directions), expected)
+        assert not expected[0]
+    assert not _blind_poses(problem, robot, np.zeros((0, 3))).any()
+
+
+def test_variances_of_the_points_in_use() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(3, 6, 6))
+    part, use = half @ np.swapaxes(half, 1, 2), np.array([[True, False], [True, True], [False, True]])
+    expected = [np.trace(part[n, 3 * t : 3 * t + 3, 3 * t : 3 * t + 3]) for n, t in np.argwhere(use)]
+    np.testing.assert_allclose(_variances(part, use), expected, rtol=1e-12)
+
+
+def test_rows_that_are_copies_are_counted() -> None:
+    robot = kuka("d1")
+    q = random_configurations(robot, 4, 1)[[0, 1, 0, 2, 0, 3]]
+    points = robot.positions(q).copy()
+    assert copied_rows(Measurements(robot.joint_names, q, points)) == 2
+    points[2] += 1e-9
+    points[1] = points[3] = np.nan
+    assert copied_rows(Measurements(robot.joint_names, q, points)) == 1
+
+
+@pytest.mark.parametrize(
+    ("visits", "gone", "since"),
+    [
+        (40, range(35, 40), 35),  # one of 658008 choices
+        (40, (34, 36, 37, 38, 39), None),  # not the last ones
+        (40, range(38, 40), None),  # one of 780: it may be chance
+        (46, range(44, 46), 44),  # one of 1035
+        (40, range(40), None),
+        (40, (), None),
+    ],
+)
+def test_something_moved_if_the_last_visits_are_rejected(visits: int, gone: range, since: int | None) -> None:
+    seen, use = np.ones((visits, 2), bool), np.ones((visits, 2), bool)
+    use[list(gone)] = False
+    assert rejected_since(seen, use) == since
+    seen = np.vstack([np.zeros((3, 2), bool), seen])  # visits without a point do not count
+    use = np.vstack([np.zeros((3, 2), bool), use])
+    assert rejected_since(seen, use) == (None if since is None else since + 3)
+
+
+def test_what_happened_to_points_that_fit_elsewhere() -> None:
+    robot = Robot.load("kuka_kr270").with_targets([[0.0, 0.1, 0.05], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0]])
+    q = random_configurations(robot, 8, 2)
+    predicted = robot.positions(q)
+    points, rejected = predicted + 1e-5, np.zeros((8, 3), bool)
+    points[1, [0, 2]] = points[1, [2, 0]]
+    rejected[1, [0, 2]] = True
+    points[[3, 4]] = points[[4, 3]]
+    rejected[[3, 4]] = True
+    points[6, 1] = predicted[2, 1] + 2e-5
+    rejected[6, 1] = True
+    points[7, 0] += 0.3
+    rejected[7, 0] = True
+    words = explain(predicted, Measurements(robot.joint_names, q, points), rejected, 1e-4)
+    expected = {
+        (1, 0): "fits target 3: targets exchanged?",
+        (1, 2): "fits target 1: targets exchanged?",
+        (6, 1): "fits the configuration of row 2: rows exchanged?",
+    }
+    for target in range(3):
+        expected[3, target] = "fits the configuration of row 4: rows exchanged?"
+        expected[4, target] = "fits the configuration of row 3: rows exchanged?"
+    assert words == expected
+    assert explain(predicted, Measurements(robot.joint_names, q, points), rejected, 1e-6) == {}
