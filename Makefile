@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything that needs set-up does it first.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test prove fuzz mutation coverage docs lint wheel bench soak faults clean
+.PHONY: help setup demo test prove fuzz mutation coverage docs lint wheel bench soak faults kills crashes clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -51,6 +51,12 @@ soak: setup ## the identifier at 1 kHz for 10 minutes: none lost, memory flat (S
 
 faults: setup ## every fault × 20 seeds through the nodes, simulated clock: a quarter of an hour (FAULTS='--seeds 2'; JSON to results/)
 	@mkdir -p results; . ./env.sh && OMP_NUM_THREADS=1 python bench/faults_nodes.py $(FAULTS) > results/faults_nodes.json
+
+kills: setup ## the identifier killed with -9 at 1 000 random instants: half an hour (KILLS='--count 20'; JSON to results/)
+	@mkdir -p results; . ./env.sh && OMP_NUM_THREADS=1 python bench/kills.py $(KILLS) > results/kills.json
+
+crashes: setup ## writers killed at every system call, full disks, power cuts: minutes (CRASHES='--every 10'; JSON to results/)
+	@mkdir -p results; . ./env.sh && OMP_NUM_THREADS=1 python bench/crashes.py $(CRASHES) > results/crashes.json
 
 clean: ## remove what was made: .venv, build, install, log, caches
 	rm -rf .venv build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
