@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 from robots import random_configurations
 
-from calib_planner import IdentificationProblem, Measurements, Robot
+from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.error_model import ErrorModel, JointFunctions, Knowledge, typical
+from calib_planner.identification import solver
 from calib_planner.identification.rejection import copied_rows, explain, rejected_since
-from calib_planner.identification.solver import _blind_poses, _hardly_seen, _variances, _with_fixed
+from calib_planner.identification.solver import (
+    _blind_poses,
+    _hardly_seen,
+    _point_rows,
+    _variances,
+    _with_fixed,
+    place_nominal,
+)
+from calib_planner.robot import BASE_PARAMETERS, rotation, target_parameters
 
 SIGMA = 3e-5
 
@@ -143,3 +152,65 @@ def test_what_happened_to_points_that_fit_elsewhere() -> None:
         expected[4, target] = "fits the configuration of row 3: rows exchanged?"
     assert words == expected
     assert explain(predicted, Measurements(robot.joint_names, q, points), rejected, 1e-6) == {}
+
+
+def test_base_and_targets_of_the_nominal_robot_are_those_of_least_squares() -> None:
+    """No small motion of the base or of the targets brings the points nearer."""
+    robot = Robot.load("kuka_kr270").with_targets([[0.0, 0.1, 0.05], [0.2, 0.0, 0.1]])
+    robot = robot.with_parameters("full", ("base", "tool"))
+    rng, q = np.random.default_rng(0), random_configurations(robot, 12, 2)
+    real = robot.with_base(rotation(2, 1.1) @ rotation(0, 0.3), [1.0, -2.0, 0.5])
+    points = real.with_targets([[0.1, 0.0, 0.2], [0.0, -0.1, 0.1]]).positions(q).copy()
+    points += 5e-3 * rng.standard_normal(points.shape)
+    points[3, 1] = np.nan
+    data = Measurements(robot.joint_names, q, points)
+    placed = place_nominal(IdentificationProblem(robot, data, SIGMA, ErrorModel.paper()))
+    names = [*BASE_PARAMETERS, *target_parameters(2)]
+    free = replace(placed, parameter_names=tuple(names))
+    apart = np.where(data.seen[:, :, None], points - placed.positions(q), 0.0).ravel()
+    jacobian = free.jacobian(q).reshape(72, -1) * np.repeat(data.seen.ravel(), 3)[:, None]
+    scale = np.linalg.norm(jacobian, axis=0) * np.linalg.norm(apart)
+    np.testing.assert_allclose(jacobian.T @ apart / scale, 0.0, atol=1e-7)
+    own = robot.with_parameters("full")
+    assert place_nominal(IdentificationProblem(own, data, SIGMA, ErrorModel.paper())) is own
+
+
+def test_a_rejected_point_belongs_elsewhere_if_it_fits_there_as_others_fit_their_places() -> None:
+    robot = kuka("d1,q2")
+    q = random_configurations(robot, 8, 2)
+    predicted = robot.positions(q)
+    points, out = predicted + 1e-4, np.zeros((8, 1), bool)
+    points[3, 0], points[5, 0] = predicted[6, 0] + 2e-4, predicted[1, 0] + 6e-4
+    out[[3, 5]] = True
+    problem = IdentificationProblem(
+        robot, Measurements(robot.joint_names, q, points), SIGMA, ErrorModel.paper(3e-5)
+    )
+    normalised = np.where(out, 50.0, 1.0)
+    normalised[5] = 3.0
+    near, far = _point_rows(problem, predicted, normalised, out, 4.0)
+    assert [(point.row, point.target) for point in (near, far)] == [(3, 1), (5, 1)]
+    assert far.residual == pytest.approx(np.linalg.norm(points[5] - predicted[5]), rel=1e-12)
+    assert (near.normalised_residual, far.normalised_residual) == (50.0, 3.0)
+    assert "fits the configuration of row 6" in near.reason and "50 standard deviations (gate 4)" in near.reason
+    assert "shifted" not in near.reason
+    assert "fits" not in far.reason and "one of a run of visits that are all shifted" in far.reason
+
+
+def test_freedom_of_the_left_out_error_is_that_of_a_square_of_that_spread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A χ² with f degrees of freedom has a root mean square that is 1/√(2f) of itself uncertain."""
+    robot = kuka("d1,q2,d2,q3")
+    q = random_configurations(robot, 10, 2)
+    points = robot.positions(q) + SIGMA * np.random.default_rng(0).standard_normal((10, 1, 3))
+    problem = IdentificationProblem(
+        robot, Measurements(robot.joint_names, q, points), SIGMA, ErrorModel.paper(SIGMA)
+    )
+    fit = identify(problem).model_fit
+    assert fit is not None
+    assert solver._spare(fit) == pytest.approx(30.0 - 4.0)
+    monkeypatch.setattr(solver, "_spare", lambda fit: np.inf)
+    freedom = solver._freedom_left_out(fit.left_out, fit)
+    assert 1.0 / np.sqrt(2.0 * freedom) == pytest.approx(fit.left_out.excess[1], rel=1e-9)
+    monkeypatch.setattr(solver, "_spare", lambda fit: 0.1)
+    assert solver._freedom_left_out(fit.left_out, fit) == 0.1
