@@ -84,8 +84,10 @@ def kinematics_picture(rows: Any, axes: Any) -> None:
         [f"{r['batch']:,}" for r in rows],
         {"calib_planner": [r["ours_ns"] for r in rows], "Pinocchio": [r["pinocchio_ns"] for r in rows]},
         "ns per configuration",
+        bars=False,
     )
     axes.set_yscale("log")
+    axes.set_ylim(10.0, 10_000.0)
 
 
 def figaroh_table(result: Any) -> tuple[list[str], list[list[str]]]:
@@ -104,10 +106,14 @@ def figaroh_picture(result: Any, axes: Any) -> None:
     medians = result["figaroh"]["medians"]
     names = [n if n.startswith("ours") else f"FIGAROH {n}" for n in medians]
     values = [1e6 * r["error_m"] for r in medians.values()]
-    axes.barh(names, values, color=[OURS if n.startswith("ours") else THEIRS for n in medians])
+    for at, (name, value) in enumerate(zip(names, values, strict=True)):
+        axes.plot(value, at, "o", color=OURS if name.startswith("ours") else THEIRS, markersize=9)
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(axis="y", alpha=0.3)
     axes.invert_yaxis()
     axes.set_xlabel("held-out error, µm")
     axes.set_xscale("log")
+    axes.set_xlim(5.0, 500.0)
 
 
 def scipy_table(result: Any) -> tuple[list[str], list[list[str]]]:
@@ -152,7 +158,9 @@ def pools_table(result: Any) -> tuple[list[str], list[list[str]]]:
     rows = []
     for pool in result["pools"]:
         for e in pool["choices"]:
-            theirs = [f"{pool['figaroh_seconds']:.1f}", f"{e['d_ratio']:.3f}"] if "d_ratio" in e else ["", ""]
+            theirs = ["no answer", ""]
+            if "d_ratio" in e:
+                theirs = [f"{pool['figaroh_seconds']:.1f}", f"{e['d_ratio']:.3f}"]
             rows.append(
                 [str(pool["candidates"]), str(e["n"]), f"{e['seconds']:.3f}", f"{e['efficiency']:.3f}", *theirs]
             )
@@ -164,8 +172,9 @@ def pools_picture(result: Any, axes: Any) -> None:
     sides = {"calib_planner": [median(e["seconds"] for e in p["choices"]) for p in pools]}
     if pools[0]["figaroh_seconds"]:
         sides["FIGAROH"] = [p["figaroh_seconds"] for p in pools]
-    paired(axes, [f"{p['candidates']} candidates" for p in pools], sides, "seconds")
+    paired(axes, [f"{p['candidates']} candidates" for p in pools], sides, "seconds", bars=False)
     axes.set_yscale("log")
+    axes.set_ylim(0.1, 1000.0)
 
 
 def planning_table(result: Any) -> tuple[list[str], list[list[str]]]:
@@ -180,8 +189,8 @@ def planning_table(result: Any) -> tuple[list[str], list[list[str]]]:
 def planning_picture(result: Any, axes: Any) -> None:
     rows = result["efficiency"]
     sides = {"median": [r["median"] for r in rows], "worst": [r["worst"] for r in rows]}
-    paired(axes, [f"{r['configurations']}" for r in rows], sides, "share of the proved bound")
-    axes.set_ylim(0.9, 1.0)
+    paired(axes, [f"{r['configurations']}" for r in rows], sides, "share of the proved bound", bars=False)
+    axes.set_ylim(0.95, 1.0)
     axes.set_xlabel("configurations")
 
 
@@ -250,6 +259,7 @@ def sizes_picture(result: Any, axes: Any) -> None:
     axes.set_xlabel("configurations measured")
     axes.set_ylabel("error, planned / random")
     axes.set_ylim(0, 1.1)
+    axes.set_xticks([n for n, _ in part])
     axes.legend(frameon=False)
 
 
@@ -274,8 +284,8 @@ def model_picture(result: Any, axes: Any) -> None:
     parts = _models(result)
     achieved = [median(r["rms_mm"] for r in p) for _, p in parts]
     predicted = [median(r["rms_mm"] * r["predicted"] for r in p) for _, p in parts]
-    paired(axes, [c for c, _ in parts], {"achieved": achieved, "predicted": predicted}, "held-out rms, mm")
-    axes.tick_params(axis="x", labelrotation=20)
+    names = [c.replace("_", " ").replace(" x ", "×").replace(" ", "\n") for c, _ in parts]
+    paired(axes, names, {"achieved": achieved, "predicted": predicted}, "held-out rms, mm")
 
 
 def _models(result: Any) -> list[tuple[str, list[Any]]]:
@@ -283,13 +293,18 @@ def _models(result: Any) -> list[tuple[str, list[Any]]]:
     return [(c, [r for r in rows if r["case"] == c]) for c in dict.fromkeys(r["case"] for r in rows)]
 
 
-def paired(axes: Any, names: list[str], sides: dict[str, list[float]], label: str) -> None:
-    """Bars of two sides beside each other."""
+def paired(axes: Any, names: list[str], sides: dict[str, list[float]], label: str, bars: bool = True) -> None:
+    """Two sides beside each other: bars, or dots for an axis that does not begin at zero."""
     for k, ((side, values), colour) in enumerate(zip(sides.items(), (OURS, THEIRS), strict=False)):
-        axes.bar([i + 0.4 * k - 0.2 for i in range(len(names))], values, 0.38, label=side, color=colour)
+        at = range(len(names))
+        if bars:
+            axes.bar([i + 0.4 * k - 0.2 for i in at], values, 0.38, label=side, color=colour)
+        else:
+            axes.plot(at, values, "o", label=side, color=colour, markersize=9)
     axes.set_xticks(range(len(names)), names)
+    axes.set_xlim(-0.6, len(names) - 0.4)
     axes.set_ylabel(label)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
 
 
 PARTS = (
@@ -359,7 +374,8 @@ PARTS = (
         "pools",
         "Choosing from a pool, beside FIGAROH",
         "D-optimal choice from measured configurations of the UR10, against FIGAROH's cone program, judged "
-        "by D = det^(1/p) of the chosen rows; ours with its bound.",
+        "by D = det^(1/p) of the chosen rows; ours with its bound. FIGAROH may take 16 GiB of memory; where "
+        "that is not enough, it has no answer.",
         pools_table,
         pools_picture,
     ),
@@ -406,10 +422,10 @@ def page(results: Path) -> str:
     missing = []
     for part in PARTS:
         path = results / f"{part.bench}.json"
-        if not path.is_file():
+        result = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        if not result:  # not run, or its data or its peer are not there
             missing.append(f"`bench/{part.bench}.py`")
             continue
-        result = json.loads(path.read_text(encoding="utf-8"))
         figure, axes = plt.subplots(figsize=(6.4, 2.8), layout="constrained")
         part.picture(result, axes)
         axes.spines[["top", "right"]].set_visible(False)

@@ -9,7 +9,8 @@ tracker and target unknown (level ``full``, unknown base and tool), reduced to t
 get the same base regressor and are judged by det(Σ XᵢᵀXᵢ) of the chosen rows, each row once, same number of rows:
 those FIGAROH keeps (weight > 1e-5), and the 10, 20 and 30 heaviest. Ours includes the bound and the choice.
 FIGAROH (PyPI ``figaroh`` 1.0.2 with picos and cvxopt) may live in another environment: ``--figaroh`` or
-the variable FIGAROH_PYTHON names its interpreter; without it only ours is measured.
+the variable FIGAROH_PYTHON names its interpreter; without it only ours is measured. It may take 16 GiB (2000
+candidates wanted more than the 24 GiB of a machine); where it has no answer, only ours is measured.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -43,6 +45,8 @@ from calib_planner.planning import (
 from calib_planner.robot import analyse
 
 COUNTS = (10, 20, 30)
+MEMORY = 16 * 2**30
+"""Bytes that FIGAROH may take: a machine that is out of memory ends other programs, too."""
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -96,9 +100,17 @@ def figaroh(rows: FloatArray, python: str) -> dict[str, Any] | None:
         path = Path(folder) / "pool.npz"
         np.savez(path, rows=rows)
         script = str(Path(__file__).with_name("figaroh_socp.py"))
-        done = subprocess.run([python, script, str(path)], capture_output=True, text=True, check=True)
+        done = subprocess.run([python, script, str(path)], capture_output=True, text=True, preexec_fn=_in_memory)
+    if done.returncode:
+        why = (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
+        print(f"pools: FIGAROH has no answer for {len(rows)} candidates: {why}", file=sys.stderr)
+        return None
     answer: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return answer
+
+
+def _in_memory() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
 
 
 def compare(robot: Robot, q: FloatArray, python: str | None, repeats: int) -> dict[str, Any]:
