@@ -214,3 +214,20 @@ def test_freedom_of_the_left_out_error_is_that_of_a_square_of_that_spread(
     assert 1.0 / np.sqrt(2.0 * freedom) == pytest.approx(fit.left_out.excess[1], rel=1e-9)
     monkeypatch.setattr(solver, "_spare", lambda fit: 0.1)
     assert solver._freedom_left_out(fit.left_out, fit) == 0.1
+
+
+def test_what_the_fit_leaves_counts_configurations_once_and_parameters_by_what_the_data_tell() -> None:
+    """Of a parameter with a prior that is 1 − C/σ², of one without it all."""
+    robot = kuka("d1,q2,d2,q3")
+    q = random_configurations(robot, 9, 2)[[0, 1, 2, 3, 4, 5, 6, 7, 8, 2, 2]]
+    points = robot.positions(q) + SIGMA * np.random.default_rng(0).standard_normal((11, 1, 3))
+    points[2] = points[5] = np.nan
+    model = replace(typical(), joint_functions=None)
+    fit = identify(
+        IdentificationProblem(robot, Measurements(robot.joint_names, q, points), error_model=model)
+    ).model_fit
+    assert fit is not None and len(set(fit.left_out.groups.tolist())) == 9
+    variances = fit.knowledge.model.variances(fit.knowledge.robot)[:4]
+    told = 1.0 - np.diag(fit.knowledge.covariance)[:4] / variances
+    assert np.isfinite(variances).all() and (told > 0.0).all() and (told < 1.0).all() and told.min() < 0.95
+    assert solver._spare(fit) == pytest.approx(3.0 * 8 - told.sum(), rel=1e-9)
