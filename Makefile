@@ -52,7 +52,7 @@ soak: setup ## the identifier at 1 kHz for 10 minutes: none lost, memory flat (S
 faults: setup ## every fault × 20 seeds through the nodes, simulated clock: a quarter of an hour (FAULTS='--seeds 2'; JSON to results/)
 	@mkdir -p results; . ./env.sh && OMP_NUM_THREADS=1 python bench/faults_nodes.py $(FAULTS) > results/faults_nodes.json
 
-kills: setup ## the identifier killed with -9 at 1 000 random instants: half an hour (KILLS='--count 20'; JSON to results/)
+kills: setup ## the identifier killed with -9 at 1 000 random instants: a quarter of an hour (KILLS='--count 20'; JSON to results/)
 	@mkdir -p results; . ./env.sh && OMP_NUM_THREADS=1 python bench/kills.py $(KILLS) > results/kills.json
 
 crashes: setup ## writers killed at every system call, full disks, power cuts: minutes (CRASHES='--every 10'; JSON to results/)
