@@ -39,7 +39,7 @@ BENCHES: dict[str, tuple[str, ...]] = {
     "kinematics": (),
     "identification": ("--sections", "figaroh", "--cells", "3"),
     "least_squares": ("--seeds", "5", "--simulated", "5"),
-    "pools": ("--sizes", "500", "2000"),
+    "candidates": ("--sizes", "500", "2000"),
     "planning": ("--poses", "20"),
     "real_robot": ("--seeds", "6", "--random", "100"),
     "half_and_double": ("--seeds", "3", "--random", "30"),
@@ -201,7 +201,7 @@ def measured_table(result: Any) -> tuple[list[str], list[list[str]]]:
         "random, mean mm",
         "beats by mean",
         "beats by 95th percentile",
-        "worst pool",
+        "worst draw",
     ]
     rows = []
     for n, part in _counts(result["real_robot"]):
@@ -328,9 +328,9 @@ PARTS = (
     Part(
         "real_robot",
         "Planned and random configurations of a measured UR10",
-        "From a pool of 600 measured rows, drawn by seed, as many rows are planned as are chosen at random,"
+        "From 600 measured rows, drawn by seed, as many rows are planned as are chosen at random,"
         " 100 times; the default estimator identifies, all other rows of the file judge. Medians over six "
-        "pools; the last column is the smaller of both shares in the worst pool.",
+        "draws; the last column is the smaller of both shares in the worst draw.",
         measured_table,
         measured_picture,
     ),
@@ -371,8 +371,8 @@ PARTS = (
         figaroh_picture,
     ),
     Part(
-        "pools",
-        "Choosing from a pool, beside FIGAROH",
+        "candidates",
+        "Choosing from candidates, beside FIGAROH",
         "D-optimal choice from measured configurations of the UR10, against FIGAROH's cone program, judged "
         "by D = det^(1/p) of the chosen rows; ours with its bound. FIGAROH may take 16 GiB of memory; where "
         "that is not enough, it has no answer.",

@@ -14,10 +14,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 pytest_plugins = ["processor_time"]
 
-# Without shared memory: a node killed -9 just when it creates a segment leaves one that is never ready, and every
-# participant on the machine that opens it, in whatever domain, waits for ever (Fast DDS 2.14).
-os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
-
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     # A shell that starts us in the background has SIGINT ignored, and every process of a test would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)

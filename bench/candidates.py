@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """D-optimal choice from a pool of real configurations, against FIGAROH's SOCP, in one run.
 
-    python bench/pools.py [--data ../shared/data] [--json FILE] [--figaroh PYTHON] [--sizes 500 2000]
+    python bench/candidates.py [--data ../shared/data] [--json FILE] [--figaroh PYTHON] [--sizes 500 2000]
 
 The pool is a seeded random part of ``ur10_tracker/random_poses.csv``; the parameters are all placement errors,
 tracker and target unknown (level ``full``, unknown base and tool), reduced to the identifiable ones. Both sides
@@ -103,7 +103,7 @@ def figaroh(rows: FloatArray, python: str) -> dict[str, Any] | None:
         done = subprocess.run([python, script, str(path)], capture_output=True, text=True, preexec_fn=_in_memory)
     if done.returncode:
         why = (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
-        print(f"pools: FIGAROH has no answer for {len(rows)} candidates: {why}", file=sys.stderr)
+        print(f"candidates: FIGAROH has no answer for {len(rows)} candidates: {why}", file=sys.stderr)
         return None
     answer: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return answer
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     if not (args.data / "ur10_tracker").is_dir():
-        print(f"pools: no measured data at {args.data}: nothing measured")
+        print(f"candidates: no measured data at {args.data}: nothing measured")
         return
     robot, q = ur10(args.data)
     rng = np.random.default_rng(0)
