@@ -27,7 +27,7 @@ from calib_planner_paper.reproduce import Reproduction, ReproductionSettings, nu
 from calib_planner_paper.two_link import FIGURE_2, two_link_figure
 
 SETTINGS = ReproductionSettings(random_plans=2000, calibrations=repeats(40, 100), seed=1)
-POSES = repeats("AC", "ABC")
+POSES = repeats("A", "ABC")
 """Test poses of Table 2."""
 ERRORS = 4.5
 """Standard errors within which what is random has to be."""
