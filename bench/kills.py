@@ -661,8 +661,8 @@ def without_shared_memory(folder: Path) -> Iterator[None]:
 
     A process that is killed leaves its pieces of DDS's shared memory behind; one that is killed while it makes a
     piece leaves it half made, and every process that opens it later waits for ever for the other half (boost's
-    ``managed_open_or_create``; eProsima/Fast-DDS#1144). rmw_fastrtps adds shared memory by itself where discovery is kept to the machine,
-    whatever ``FASTDDS_BUILTIN_TRANSPORTS`` says, so that it takes a profile.
+    ``managed_open_or_create``; eProsima/Fast-DDS#1144). rmw_fastrtps adds shared memory by itself where discovery
+    is kept to the machine, whatever ``FASTDDS_BUILTIN_TRANSPORTS`` says, so that it takes a profile.
     """
     folder.mkdir(parents=True, exist_ok=True)
     profile = folder / "loopback.xml"
