@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from robots import mixed, random_configurations
 
-from calib_planner import Robot
-from calib_planner.planning import Custom, Feasibility, InformationModel
+from calib_planner import PlanProblem, Robot
+from calib_planner.planning import Custom, Feasibility, InformationModel, plan_space, random_plans
 from calib_planner.planning.criteria import Determinant, log_values, ridged
 from calib_planner.planning.search.apart import nearest
 from calib_planner.planning.search.descent import (
@@ -273,3 +273,20 @@ def test_a_timetable_is_what_a_robot_that_does_one_thing_after_the_other_needs(k
     assert len(points) == 2 * 7 + np.isfinite(turns).sum()
     assert [t for _, t in points] == sorted(t for _, t in points)
     assert points[-1] == (q[3].tolist(), round(clock * 1e9))
+
+
+def test_random_plans_have_the_accuracy_of_their_configurations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each batch draws its plans with a seed of its own; ρ0 = σ √tr(J₀ (Σ JᵀJ)⁻¹ J₀ᵀ), eq. (14)."""
+    monkeypatch.setattr(random_plans, "BATCH", 12)
+    robot = Robot.load("kuka_kr270").with_parameters("d1,q2,d2")
+    pose = random_configurations(robot, 1, 3)
+    space = plan_space(PlanProblem(robot, pose, 4, repetitions=2, noise=3e-5))
+    got = random_plans.random_accuracies(space, 7, np.random.default_rng(5))
+    seeds, expected = np.random.default_rng(5).integers(0, 2**63, 3).tolist(), []
+    for many, seed in zip((3, 3, 1), seeds, strict=True):
+        q = space.feasibility.sample(np.random.default_rng(seed), 4 * many).reshape(many, 4, -1)
+        j0 = robot.jacobian(pose)[0]
+        for plan in q:
+            jacobian = robot.jacobian(plan).reshape(12, 3)
+            expected.append(3e-5 * np.sqrt(np.trace(j0 @ np.linalg.inv(2.0 * jacobian.T @ jacobian) @ j0.T)))
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
