@@ -632,31 +632,12 @@ def in_a_process(work: Callable[[], Life]) -> Life:
     return life
 
 
-UDP = """<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <transport_descriptors>
-    <transport_descriptor>
-      <transport_id>loopback</transport_id>
-      <type>UDPv4</type>
-      <interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
-    </transport_descriptor>
-  </transport_descriptors>
-  <participant profile_name="loopback" is_default_profile="true">
-    <rtps>
-      <userTransports><transport_id>loopback</transport_id></userTransports>
-      <useBuiltinTransports>false</useBuiltinTransports>
-      <builtin>
-        <initialPeersList><locator><udpv4><address>127.0.0.1</address></udpv4></locator></initialPeersList>
-      </builtin>
-    </rtps>
-  </participant>
-</profiles>
-"""
+LOOPBACK = Path(__file__).with_name("loopback.xml")
 """Profile of Fast DDS: on this machine only, without shared memory."""
 
 
 @contextmanager
-def without_shared_memory(folder: Path) -> Iterator[None]:
+def without_shared_memory() -> Iterator[None]:
     """Until it is left, nodes that are made speak by UDP on this machine.
 
     A process that is killed leaves its pieces of DDS's shared memory behind; one that is killed while it makes a
@@ -664,11 +645,8 @@ def without_shared_memory(folder: Path) -> Iterator[None]:
     ``managed_open_or_create``; eProsima/Fast-DDS#1144). rmw_fastrtps adds shared memory by itself where discovery
     is kept to the machine, whatever ``FASTDDS_BUILTIN_TRANSPORTS`` says, so that it takes a profile.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    profile = folder / "loopback.xml"
-    profile.write_text(UDP)
     wanted = {
-        "FASTRTPS_DEFAULT_PROFILES_FILE": str(profile),
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(LOOPBACK),
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
     }
@@ -718,7 +696,7 @@ def run(count: int, seed: int, folder: Path, say: Callable[[str], None] = lambda
     """Campaigns until a node was killed so many times, or until ten faults were found."""
     found, began, rng = Found(), time.monotonic(), random.Random(seed)
     gc.freeze()
-    with without_shared_memory(folder), own_domain() as domain:
+    with without_shared_memory(), own_domain() as domain:
 
         def lived(place: str, heard: Heard, aim: Aim | None) -> Life:
             turn = random.Random(rng.random())
