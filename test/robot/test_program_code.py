@@ -12,6 +12,7 @@ import pytest
 from robots import mixed, random_chain
 
 from calib_planner import Robot
+from calib_planner.robot import Element, kinematics
 from calib_planner.robot.kinematics import Program
 
 ROBOTS: dict[str, Callable[[], Robot]] = {
@@ -34,6 +35,11 @@ OPERATIONS: list[Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.n
     lambda a, b, c, d: a * b - c,
     lambda a, b, c, d: c - a * b,
 ]
+
+
+def flat(robot: Robot) -> list[Element]:
+    """All elements, of the trunk and then of the branches."""
+    return [*robot.elements, *(e for branch in robot.targets for e in branch)]
 
 
 def parts_of(program: Program) -> tuple[list[int], list[list[list[int]]]]:
@@ -111,3 +117,30 @@ def test_nothing_is_computed_in_vain(name: str) -> None:
     assert nodes == 1 + max([0, *(entry[3] for entry in scalars)])
     assert scratch == len({register for _, register in registers}) <= len(registers)
     assert slots >= 1 + max(slot for part in (inputs, constants, registers) for slot, _ in part)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_shorter_of_both_programs_is_taken_by_counting(name: str) -> None:
+    """Traced from the base or from behind the first joint that turns: fewer operations and copies."""
+    robot = ROBOTS[name]()
+    wanted = robot._layout.parameter_elements + robot._layout.joint_elements
+    structure = kinematics.structure_of(
+        robot.elements,
+        robot.targets,
+        kinematics.codes_of(
+            robot._nominal_amounts, np.array([e.is_rotation and e.joint is None for e in flat(robot)])
+        ),
+        wanted,
+        wanted,
+    )
+    turning = [k for k, e in enumerate(robot.elements) if e.is_rotation and e.joint is not None]
+    split = kinematics.first_turn(structure)
+    assert split == (turning[0] + 1 if turning else 0)
+    shape, lengths = (len(robot.targets), len(wanted), len(wanted)), []
+    for each in (0, split):
+        traced = kinematics.trace(structure, each)
+        program = kinematics._lay_out(*traced, shape)
+        lengths.append(len(program.vectors) + len(program.copies))
+        assert kinematics._operations(*traced) == lengths[-1]
+    taken = kinematics.compile_program(structure)
+    assert len(taken.vectors) + len(taken.copies) == min(lengths)
