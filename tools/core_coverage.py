@@ -8,8 +8,8 @@ the command line, of the pages of the documentation and the golden ones; those o
 take some more branches. coverage.py counts, in children of the tests too.
 
 The pages with every line are ``build/coverage/index.html``, the figures ``build/coverage/core.json``. ``--write``
-puts the table into docs/proof.md. Arguments that are not known go to pytest; ``--more FILE …`` adds what these
-tests take to the last measurement.
+puts the table into docs/proof.md and the figure into docs/quality-declaration.md; ``--more FILE …`` adds what
+these tests take to the last measurement. Arguments that are not known go to pytest.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import argparse
 import datetime
 import json
 import os
+import re
 import subprocess
 import sys
 from collections import defaultdict
@@ -25,9 +26,19 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build" / "coverage"
-PAGE = ROOT / "docs" / "proof.md"
+PAGE, DECLARATION = ROOT / "docs" / "proof.md", ROOT / "docs" / "quality-declaration.md"
+TOLD = re.compile(r"[\d.]+ % of the branches of the core")
+"""The same figure in the declaration."""
 BEGIN, END = "<!-- coverage: written by tools/core_coverage.py --write -->\n", "<!-- end of coverage -->\n"
-NOT_OF_THE_CORE = ("test/ros", "test/page")
+NOT_OF_THE_CORE = (
+    "test/ros",
+    "test/page",
+    "test/golden/test_nodes.py",
+    "test/test_docs_build.py",
+    "test/test_packaging.py",
+    "test/test_rooms.py",
+)
+"""Tests of nodes, and those that run no code of the core."""
 CANNOT = "test/cli/test_commands.py::test_commands_import_what_they_use"
 """It looks at what a command imports, and coverage.py is imported then."""
 KEYS = ("num_branches", "covered_branches", "num_statements", "covered_lines")
@@ -44,7 +55,7 @@ def measured(arguments: list[str], more: list[str]) -> int:
     for old in FOLDER.glob("data*"):
         if not (more and old.name == "data"):
             old.unlink()
-    chosen = more or ["test", *(f"--ignore={folder}" for folder in NOT_OF_THE_CORE), f"--deselect={CANNOT}"]
+    chosen = more or ["test", *(f"--ignore={path}" for path in NOT_OF_THE_CORE), f"--deselect={CANNOT}"]
     status = coverage(
         "run", "--parallel-mode", "-m", "pytest", "-q", "-p", "no:cacheprovider", *chosen, *arguments
     )
@@ -66,7 +77,7 @@ def table(document: dict) -> str:
     """Markdown: a row a room, and all together."""
     rooms = rooms_of(document)
     rooms["**core**"] = [sum(column) for column in zip(*rooms.values(), strict=True)]
-    lines = ["| room | branches | taken | | lines |", "|---|---|---|---|---|"]
+    lines = ["| room | branches | taken | share | lines |", "|---|---|---|---|---|"]
     for room, (branches, taken, statements, run) in rooms.items():
         lines.append(f"| {room} | {branches} | {taken} | {taken / branches:.2%} | {run / statements:.2%} |")
     return "\n".join(lines).replace("%", " %") + "\n"
@@ -78,7 +89,10 @@ def commit() -> str:
 
 
 def write(rows: str) -> None:
-    """Put the table, the date and the commit into the page."""
+    """Put the table, the date and the commit into the page, and the figure into the declaration."""
+    share = rows.rstrip().splitlines()[-1].split("|")[4].strip()
+    declaration = TOLD.sub(f"{share} of the branches of the core", DECLARATION.read_text(encoding="utf-8"))
+    DECLARATION.write_text(declaration, encoding="utf-8")
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
     python = ".".join(map(str, sys.version_info[:2]))
@@ -88,7 +102,7 @@ def write(rows: str) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--write", action="store_true", help="put the table into docs/proof.md")
+    parser.add_argument("--write", action="store_true", help="put table and figure into docs/")
     parser.add_argument("--report", action="store_true", help="the last measurement again; no test runs")
     parser.add_argument(
         "--more", nargs="+", default=[], metavar="FILE", help="tests that are added to the last ones"

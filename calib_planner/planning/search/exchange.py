@@ -441,13 +441,11 @@ class _Chosen:
         """(p, p) M⁻¹, M with a ridge."""
         return np.asarray(np.linalg.inv(slightly_ridged(self.matrix[None])[0]))
 
-    def added(self, new: IntArray, position: int | None) -> FloatArray:
+    def added(self, new: IntArray, position: int) -> FloatArray:
         """(K, r, p) rows U of what each of ``new`` (K,) adds to the choice without the row at ``position``."""
         shared, factor, r = self.shared, self.problem.factor, self.r
-        inverse = self.inverse
-        if position is not None:
-            place = slice(position * r, (position + 1) * r)
-            inverse = inverse - inverse[:, place] @ np.linalg.solve(inverse[place, place], inverse[place])
+        inverse, place = self.inverse, slice(position * r, (position + 1) * r)
+        inverse = inverse - inverse[:, place] @ np.linalg.solve(inverse[place, place], inverse[place])
         cross = factor**2 * shared.cross[new][:, :, : self.size].reshape(len(new) * r, -1)
         weights = cross @ inverse
         left = shared.columns[new] * shared.scales(factor) - (weights @ self.columns).reshape(len(new), r, -1)
