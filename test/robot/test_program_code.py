@@ -144,3 +144,41 @@ def test_the_shorter_of_both_programs_is_taken_by_counting(name: str) -> None:
         assert kinematics._operations(*traced) == lengths[-1]
     taken = kinematics.compile_program(structure)
     assert len(taken.vectors) + len(taken.copies) == min(lengths)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_program_may_be_traced_from_any_element(name: str) -> None:
+    """Positions, columns, axes and origins of all elements are those of the trace in the base frame."""
+    robot = ROBOTS[name]()
+    wanted, trunk = tuple(range(len(flat(robot)))), tuple(range(len(robot.elements)))
+    amounts = robot._nominal_amounts + 1e-3 * (robot._nominal_amounts != 0.0)
+    turning = np.array([e.is_rotation and e.joint is None for e in flat(robot)])
+    structure = kinematics.structure_of(
+        robot.elements, robot.targets, kinematics.codes_of(amounts, turning), wanted, trunk, trunk
+    )
+    q = np.random.default_rng(0).uniform(-2.0, 2.0, (len(robot.joint_names), 2))
+    shape, expected = (len(robot.targets), len(wanted), len(trunk)), None
+    for split in (0, kinematics.first_turn(structure), len(trunk) // 2):
+        program = kinematics._lay_out(*kinematics.trace(structure, split), shape)
+        got = program.run_numpy(q, amounts)
+        expected = got if expected is None else expected
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(interpreted(program, q, amounts), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_register_is_free_again_when_its_vector_has_been_read(name: str) -> None:
+    """There are as many as vectors live at once: from the operation that makes one to the last that reads it."""
+    robot = ROBOTS[name]()
+    wanted = robot._layout.parameter_elements + robot._layout.joint_elements
+    program = robot._program(robot._nominal_amounts, wanted, wanted)
+    (_, _, _, scratch, _), parts = parts_of(program)
+    plain = [((a, b), slot) for _, a, b, slot in program.vectors]
+    fused = [(tuple(entry[1:5]), entry[5]) for entry in parts[1]]
+    for vectors, registers, count in ((plain, program.registers, program.scratch), (fused, parts[6], scratch)):
+        made = {slot: step for step, (_, slot) in enumerate(vectors)}
+        last = {slot: step for step, (operands, _) in enumerate(vectors) for slot in operands}
+        last |= {slot: len(vectors) for _, sign, slot in program.copies if sign}
+        slots = [slot for slot, _ in registers]
+        live = [sum(made[s] <= step <= last[s] for s in slots) for step in range(len(vectors))]
+        assert count == max(live, default=0)
