@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from robots import mixed, random_configurations
 
-from calib_planner import PlanProblem, Robot
+from calib_planner import InputError, PlanProblem, Robot
 from calib_planner.planning import Custom, Feasibility, InformationModel, plan_space, random_plans
 from calib_planner.planning.criteria import Determinant, log_values, ridged
 from calib_planner.planning.search.apart import nearest
@@ -290,3 +290,15 @@ def test_random_plans_have_the_accuracy_of_their_configurations(monkeypatch: pyt
             jacobian = robot.jacobian(plan).reshape(12, 3)
             expected.append(3e-5 * np.sqrt(np.trace(j0 @ np.linalg.inv(2.0 * jacobian.T @ jacobian) @ j0.T)))
     np.testing.assert_allclose(got, expected, rtol=1e-6)
+
+
+def test_a_tour_may_be_as_long_as_a_duration_can_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot.load("planar_2r")
+    q, pace = np.array([[0.1, 0.0], [0.3, 0.0]]), Pace([10.0, 10.0], dwell=4.0, settle=1.0)
+    monkeypatch.setattr(
+        "calib_planner.planning.tour.LONGEST", 12
+    )  # two moves of a second, two standstills of five
+    assert visit_times(robot, q, 1, pace, q[0] - 0.2).seconds == 12.0
+    monkeypatch.setattr("calib_planner.planning.tour.LONGEST", 11)
+    with pytest.raises(InputError, match="shorten the standstill"):
+        visit_times(robot, q, 1, pace, q[0] - 0.2)

@@ -119,3 +119,11 @@ def test_ways_are_joined_end_to_end() -> None:
 def test_times_ascend_from_zero(times: list[float]) -> None:
     with pytest.raises(InputError, match="ascend from 0"):
         Trajectory(np.array(times), np.zeros((len(times), 2)), np.zeros((len(times), 2)))
+
+
+@pytest.mark.parametrize(("positions", "velocities"), [((3, 2), (3, 1)), ((4, 2), (3, 2)), ((3,), (3, 2))])
+def test_positions_and_velocities_have_a_row_for_each_time(
+    positions: tuple[int, ...], velocities: tuple[int, ...]
+) -> None:
+    with pytest.raises(InputError, match=r"positions|velocities"):
+        Trajectory(np.arange(3.0), np.zeros(positions), np.zeros(velocities))
