@@ -13,7 +13,7 @@ from robots import mixed, random_configurations
 from calib_planner import InputError, PlanProblem, Robot
 from calib_planner.planning import Custom, Feasibility, InformationModel, plan_space, random_plans
 from calib_planner.planning.criteria import Determinant, log_values, ridged
-from calib_planner.planning.search.apart import nearest
+from calib_planner.planning.search.apart import nearest, repelling
 from calib_planner.planning.search.descent import (
     _direction,
     bound_coordinates,
@@ -128,6 +128,11 @@ def test_wandering_and_climbing_gain_and_tell_what_they_reached() -> None:
     )
     longer, more = wander(model, criterion, prior, feasibility, start, np.random.default_rng(1), sweeps=9)
     assert value(longer) >= value(better) and more > evaluations
+    counts = [
+        wander(model, criterion, prior, feasibility, start, np.random.default_rng(1), sweeps=many, gain=gain)[1]
+        for many, gain in ((5, 1e-9), (9, 1e-9), (9, np.inf))
+    ]
+    assert counts[0] == counts[2] < counts[1]  # it ends when five sweeps gain less than that
     height = lambda q: -np.sum((q - 0.1) ** 2, axis=1)  # noqa: E731
     top, best = climb(feasibility, height, start, np.random.default_rng(1), rounds=8)
     np.testing.assert_array_equal(best, height(top))
@@ -302,3 +307,16 @@ def test_a_tour_may_be_as_long_as_a_duration_can_say(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("calib_planner.planning.tour.LONGEST", 11)
     with pytest.raises(InputError, match="shorten the standstill"):
         visit_times(robot, q, 1, pace, q[0] - 0.2)
+
+
+def test_the_cost_of_near_visits_has_the_gradient_that_is_said() -> None:
+    """By central differences, of a robot that turns and slides."""
+    robot = mixed()
+    size, joints = 3, len(robot.joint_names)
+    rows = (0.1 + 0.02 * np.random.default_rng(4).standard_normal((2, size, joints))).reshape(2, -1)
+    cost = repelling(lambda x: (np.zeros(len(x)), np.zeros(x.shape)), robot, size)
+    value, gradient = cost(rows)
+    assert (value > 0.0).all()
+    steps = 1e-6 * np.eye(rows.shape[1])
+    differences = [(cost(rows + step)[0] - cost(rows - step)[0]) / 2e-6 for step in steps]
+    np.testing.assert_allclose(gradient, np.transpose(differences), rtol=1e-5, atol=1e-6)
