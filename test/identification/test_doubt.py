@@ -30,9 +30,10 @@ def moved(problem: LinearProblem, change: np.ndarray) -> LinearProblem:
     return replace(problem, y=problem.y + change.reshape(problem.y.shape) * problem.seen)
 
 
-def test_a_points_square_is_its_left_out_residual_under_its_covariance_without_doubt() -> None:
-    """A thousandth of its own variance is added, which keeps rounding from making it negative."""
-    plain, doubt = problem_of(9, 2, missing=((3, 1),)), np.zeros((9, 2))
+@pytest.mark.parametrize("visits", [9, 60])
+def test_a_points_square_is_its_left_out_residual_under_its_covariance_without_doubt(visits: int) -> None:
+    """A thousandth of its own variance is added, and half of it is the least: rounding makes nothing negative."""
+    plain, doubt = problem_of(visits, 2, missing=((3, 1),)), np.zeros((visits, 2))
     doubt[2, 0] = doubt[7, 1] = 1e-8
     problem = replace(plain, parts={**plain.parts, "doubt": part_of(doubt)})
     solution = dense(problem)
@@ -46,7 +47,9 @@ def test_a_points_square_is_its_left_out_residual_under_its_covariance_without_d
         total = left.covariance[visit, at, at] - doubt[visit, target] * np.eye(3)
         total += 1e-3 * own[visit, target] * np.eye(3)
         error = left.residuals[visit, target]
-        assert squares[visit, target] == pytest.approx(error @ np.linalg.solve(total, error), rel=1e-6)
+        values, vectors = np.linalg.eigh(total)
+        expected = np.sum((vectors.T @ error) ** 2 / np.maximum(values, 0.5 * own[visit, target]))
+        assert squares[visit, target] == pytest.approx(expected, rel=1e-6)
     expected = np.where(seen, own * np.maximum((squares - 3.0) / 5.0, 0.0), 0.0)
     np.testing.assert_allclose(student(solution, doubt), expected, rtol=1e-9)
     assert (expected > 0.0).any() and (expected[seen] == 0.0).any()
@@ -170,3 +173,10 @@ def test_a_terms_size_and_doubt_are_what_it_moves_the_measured_points(monkeypatc
     monkeypatch.setattr(term_gain, "ENOUGH", 6)
     for term in term_gain.term_gains(model, many, coefficients, half @ half.T, gains):
         assert (term.size, term.std) == pytest.approx((terms[term.name].size, terms[term.name].std), nan_ok=True)
+    # Where visits are not alike, their number of points says for how many the few stand.
+    monkeypatch.setattr(term_gain, "ENOUGH", 3)
+    few = problem.columns[::2, :, slices["gravity"]] @ half[slices["gravity"]]
+    share = 11.0 / (problem.seen[::2].sum() / 3.0)
+    assert share % 1.0 > 0.1
+    terms = {t.name: t for t in term_gain.term_gains(model, problem, coefficients, half @ half.T, gains)}
+    assert terms["gravity"].std == pytest.approx(np.sqrt(share * np.sum(few**2) / 11.0), rel=1e-9)
