@@ -40,7 +40,7 @@ docs: setup ## make the documentation: build/docs/index.html (warnings are error
 lint: setup ## ruff and mypy
 	@. ./env.sh && ruff check . && ruff format --check . && mypy
 
-wheel: ## build the wheel; install and use it without ROS in every Python 3.10 … 3.13 that is there
+wheel: ## build sdist and wheel; install and use them without ROS in every Python 3.10 … 3.13 that is there
 	@tools/wheel.sh
 
 bench: setup ## peers, bounds, measured robots: docs/benchmarks.md with its pictures (half an hour; JSON to results/)

@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # Copyright 2026 calib_planner contributors
 # SPDX-License-Identifier: Apache-2.0
-# Builds the wheel and uses it without ROS in a fresh environment of every Python 3.10 … 3.13 that is there,
-# on the PATH or from pyenv. Says which were tried and which are missing. Usage: tools/wheel.sh [3.12 …]
+# Builds the source distribution, of it a wheel for every Python 3.10 … 3.13 that is there, on the PATH or from
+# pyenv, and uses each without ROS in a fresh environment. Says which were tried and which are missing.
+# Usage: tools/wheel.sh [3.12 …]
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 unset PYTHONPATH AMENT_PREFIX_PATH PYTHONHOME
@@ -30,16 +31,21 @@ use() { # use FOLDER: what a user does first, with the files that the wheel brou
   test -s sheet/plan_sheet.html && test -s report.html && test -s visits.src
 }
 
-mkdir "$work/source" # a copy: an older build/ would end in the wheel
+mkdir "$work/source" # a copy: an older build/ would end in the distributions
 git ls-files -co --exclude-standard -z | tar --null -T - -c | tar -x -C "$work/source"
 missing=()
 for one in ${*:-3.10 3.11 3.12 3.13}; do
   python=$(find_python "$one")
   if [ -z "$python" ]; then missing+=("$one"); continue; fi
   "$python" -m venv "$work/$one"
-  "$work/$one/bin/pip" --disable-pip-version-check wheel -q --no-deps -w "$work/wheels-$one" "$work/source"
+  if [ ! -d "$work/sdist" ]; then
+    "$python" -m venv "$work/build"
+    "$work/build/bin/pip" --disable-pip-version-check install -q build
+    "$work/build/bin/python" -m build --sdist --outdir "$work/sdist" "$work/source" >/dev/null
+  fi
+  "$work/$one/bin/pip" --disable-pip-version-check wheel -q --no-deps -w "$work/wheels-$one" "$work"/sdist/*.tar.gz
   "$work/$one/bin/pip" --disable-pip-version-check install -q "$work/wheels-$one"/*.whl
   (use "$work/$one")
-  echo "wheel: Python $one plans, identifies and writes its pages without ROS"
+  echo "wheel of the source distribution: Python $one plans, identifies and writes its pages without ROS"
 done
 if [ ${#missing[@]} -gt 0 ]; then echo "wheel: not on this machine, not tried: Python ${missing[*]}"; fi
