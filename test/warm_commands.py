@@ -3,8 +3,8 @@
 """``calib-planner`` and ``python SCRIPT`` without the time of their imports, for pages of many commands.
 
 A process that has imported the package forks once per command. The command gets the caller's streams, folder and
-words; its status comes back. The first run of every command, and every script that starts processes itself, is a
-process of its own, as a user starts it.
+words; its status comes back. The first command, the first script, and every script that starts processes itself,
+is a process of its own, as a user starts it.
 
 ``python warm_commands.py SOCKET`` is that process; it serves until its stdin ends.
 """
@@ -38,7 +38,7 @@ with socket.socket(socket.AF_UNIX) as server:
 """
 
 COMMAND = """#!/bin/sh
-mkdir "{first}/{name}-$1" 2>/dev/null && exec "{real}" "$@"
+mkdir "{first}/{name}" 2>/dev/null && exec "{real}" "$@"
 exec "{caller}" {name} "$@"
 """
 
