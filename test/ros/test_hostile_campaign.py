@@ -121,11 +121,27 @@ class Attack:
         assert {p.name for p in (self.folder / "store").iterdir()} == {FILE, f"{FILE}-wal"}
         assert not any("secret" in line.msg or "Traceback" in line.msg for line in self.logs)
 
+    def measure_to_its_end(self) -> None:
+        """Let the robot go on: the campaign reaches its end, and writes there alone."""
+        self.held = False
+        assert self.desk.call("pause")[0] and self.desk.call("resume")[0]
+        done = self.desk.until(S.DONE, 60.0)
+        assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
+        names = {p.name.replace(done.campaign_id, "ID") for p in (self.folder / "store").iterdir()}
+        assert names == {FILE, "measurements_ID.csv", "validation_ID.csv", "estimate_ID.yaml"}
+        assert [p.name for p in self.outside.iterdir()] == ["secret.txt"]
+        read = GetParameters.Request(names=["store_folder"])
+        answer = self.bench.call(GetParameters, f"{NAME}/get_parameters", read)
+        assert answer.values[0].string_value == str(self.folder / "store")
+
 
 @pytest.fixture(scope="module")
 def attack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attack]:
+    """One campaign for all attacks, in whatever order; after the last one it is measured to its end."""
     with Bench() as bench:
-        yield Attack(bench, tmp_path_factory.mktemp("campaign"))
+        under_way = Attack(bench, tmp_path_factory.mktemp("campaign"))
+        yield under_way
+        under_way.measure_to_its_end()
 
 
 # ── who says to be the identifier ────────────────────────────────────────────────────────────────────
@@ -272,27 +288,12 @@ def test_no_peer_chooses_where_is_written(attack: Attack) -> None:
     answer = attack.bench.call(SetParameters, f"{NAME}/set_parameters", SetParameters.Request(parameters=given))
     assert all(not r.successful and r.reason for r in answer.results)
     change(attack, Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+    attack.watch()  # what it measures with is made anew
     attack.bench.wait(lambda: attack.node._measuring._out.get_subscription_count())
     attack.desk.until(S.PAUSED, measured=3)
     assert attack.desk.call("resume")[0]
     attack.stuck()
     attack.check()
-
-
-# ── in the end ───────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_it_is_measured_to_its_end(attack: Attack) -> None:
-    attack.held = False
-    assert attack.desk.call("pause")[0] and attack.desk.call("resume")[0]
-    done = attack.desk.until(S.DONE, 60.0)
-    assert done.outcome == S.OUTCOME_REACHED and done.excluded == 0
-    names = {p.name.replace(done.campaign_id, "ID") for p in (attack.folder / "store").iterdir()}
-    assert names == {FILE, "measurements_ID.csv", "validation_ID.csv", "estimate_ID.yaml"}
-    assert [p.name for p in attack.outside.iterdir()] == ["secret.txt"]
-    read = GetParameters.Request(names=["store_folder"])
-    kept = attack.bench.call(GetParameters, f"{NAME}/get_parameters", read).values[0].string_value
-    assert kept == str(attack.folder / "store")
 
 
 # ── the robot, and what is in the folder ─────────────────────────────────────────────────────────────
