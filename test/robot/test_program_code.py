@@ -98,12 +98,16 @@ def test_the_code_says_what_numpy_does(name: str, everything: bool) -> None:
         assert np.isfinite(expected).all()
 
 
+def program_of_all(robot: Robot) -> Program:
+    """What computes the columns of every parameter and every joint."""
+    wanted = robot._layout.parameter_elements + robot._layout.joint_elements
+    return robot._program(robot._nominal_amounts, wanted, wanted)
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_nothing_is_computed_in_vain(name: str) -> None:
     """No product stands apart from the one sum that needs it, and every part counts what the others use."""
-    robot = ROBOTS[name]()
-    wanted = robot._layout.parameter_elements + robot._layout.joint_elements
-    program = robot._program(robot._nominal_amounts, wanted, wanted)
+    program = program_of_all(ROBOTS[name]())
     (joints, slots, rows, scratch, nodes), parts = parts_of(program)
     scalars, vectors, turns, inputs, constants, copies, registers = parts
     operands = {0: 2, 1: 2, 2: 2, 3: 4, 4: 4, 5: 3, 6: 3, 7: 3}
@@ -169,9 +173,7 @@ def test_a_program_may_be_traced_from_any_element(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_register_is_free_again_when_its_vector_has_been_read(name: str) -> None:
     """There are as many as vectors live at once: from the operation that makes one to the last that reads it."""
-    robot = ROBOTS[name]()
-    wanted = robot._layout.parameter_elements + robot._layout.joint_elements
-    program = robot._program(robot._nominal_amounts, wanted, wanted)
+    program = program_of_all(ROBOTS[name]())
     (_, _, _, scratch, _), parts = parts_of(program)
     plain = [((a, b), slot) for _, a, b, slot in program.vectors]
     fused = [(tuple(entry[1:5]), entry[5]) for entry in parts[1]]
