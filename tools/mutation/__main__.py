@@ -44,6 +44,8 @@ LIST = ROOT / "test" / "mutants.yaml"
 PAGE = ROOT / "docs" / "proof.md"
 BEGIN, END = "<!-- mutants: written by tools/mutation --write -->", "<!-- end of mutants -->"
 ROOMS = ("robot", "error_model", "planning", "identification")
+BESIDE = ("test/test_compensation.py",)
+"""Tests of formulas outside the folders of the rooms: what compensation makes of inverse kinematics."""
 FILES = {
     "robot": "kinematics elements linearisation coupling chain capsules identifiability inverse limits masses "
     "origins parameters",
@@ -184,7 +186,7 @@ def run(files: list[str], sample: int, seed: int, target: Path) -> None:
         job = {
             "files": files,
             "mutants": {f: str(work / Path(f).with_suffix("").as_posix().replace("/", ".")) for f in files},
-            "tests": [f"test/{room}" for room in ROOMS],
+            "tests": [*(f"test/{room}" for room in ROOMS), *BESIDE],
             "map": str(ENVIRONMENT / "map"),
             "out": str(work / "out"),
         }
