@@ -19,7 +19,8 @@ from calib_planner.planning import Candidates, PlanProblem, Search, plan, plan_s
 from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
 from calib_planner.planning.planner import value_of
-from calib_planner.planning.search.enumeration import best_of_all, choices_of
+from calib_planner.planning.search import enumeration
+from calib_planner.planning.search.enumeration import best_of_all, choices_of, seconds
 from calib_planner.planning.search.exchange import ChoiceProblem, RunningDeterminant, choose, scaled_rows
 from calib_planner.tracker import Isotropic
 
@@ -182,6 +183,32 @@ def test_of_few_choices_the_plan_is_the_best(criterion: str, m: int, repeat: boo
     assert f"each of the {len(values)} choices" in found.message
 
 
+@pytest.mark.parametrize("count", [7, 60])
+@pytest.mark.parametrize("criterion", ["d", "test_pose"])
+def test_the_home_configuration_may_be_among_candidates(criterion: str, count: int) -> None:
+    """There joint 4 turns about the target: plans that repeat it alone know nothing at all of that joint."""
+    robot = Robot.load("kuka_kr270").with_parameters("d1,q2,q4,d2")
+    candidates = np.zeros((count, 6))
+    candidates[-4:] = random_configurations(robot, 4, 2)
+    assert (robot.jacobian(candidates[0])[0, :, 2] == 0.0).all()
+    for repeat in (False, True):
+        asked = PlanProblem(
+            robot,
+            random_configurations(robot, 2, 8),
+            3,
+            criterion=criterion,
+            search=Search(general_weight=0.0),
+            candidates=Candidates(candidates, repeat),
+        )
+        found = plan(asked)
+        assert found.quality.status == "ok" and np.isfinite(found.quality.value)
+        best = [value_of(asked, candidates[list(rows)]) for rows in combinations(range(count - 5, count), 3)]
+        if criterion == "d":
+            assert found.quality.value >= max(best) * (1 - 1e-9)
+        else:
+            assert found.quality.value <= min(best) * (1 + 1e-9)
+
+
 def test_few_choices_with_a_whole_error_model() -> None:
     robot = Robot.load("kuka_kr270")
     candidates, model = random_configurations(robot, 8, 3), replace(typical(Isotropic(3e-5)), name="mine")
@@ -211,6 +238,72 @@ def test_many_choices_are_not_enumerated() -> None:
     assert best_of_all(problem, problem.criterion, lambda matrix: 0.0) is None
     few = ChoiceProblem(pool(0, 6), Determinant(), np.zeros((P, P)), 4)
     assert best_of_all(few, few.criterion, lambda matrix: 0.0, lambda: True) is None
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+@pytest.mark.parametrize("beside", [0, 1, 2])
+def test_of_all_choices_in_small_batches(beside: int, repeat: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The best in the mean of log Ψ over the sizes of the errors, and the best by the target."""
+    monkeypatch.setattr(enumeration, "BATCH", 7 * P * P * 3)
+    size, prior = 3, 1e-12 * np.eye(P)
+    draw = combinations_with_replacement if repeat else combinations
+    choices = list(draw(range(7), size))
+    for seed in range(4):
+        sizes = [
+            ChoiceProblem(1e-3 * pool(10 * seed + i, 7), CRITERIA["a"], prior, size, repeat)
+            for i in range(beside + 1)
+        ]
+        problem = replace(sizes[0], beside=tuple(sizes[1:]))
+        wanted = np.mean([np.log(worths(s, choices)) for s in sizes], axis=0)
+        for target in (problem.criterion, Determinant()):
+            found = best_of_all(problem, target, lambda matrix: 0.0)
+            assert found is not None and found.choices == len(choices)
+            assert tuple(found.rows) == choices[int(np.argmax(wanted))]
+            assert found.log_value == pytest.approx(wanted.max(), abs=1e-6) and wanted.max() < 0.0
+            top = worths(replace(problem, criterion=target), choices)
+            assert tuple(found.top_rows) == choices[int(np.argmax(top))]
+
+
+def test_choices_that_see_too_little_are_few_or_there_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three candidates show two parameters, two the others: a pair of one kind is worth what ``exactly`` says."""
+    rows = np.full((5, 2, P), 1e-12)
+    rows[:3, [0, 1], [0, 1]] = np.array([1.0, 2.0, 3.0])[:, None]
+    rows[3:, [0, 1], [2, 3]] = np.array([1.0, 0.5])[:, None]
+    problem = ChoiceProblem(rows, Determinant(), np.zeros((P, P)), 2)
+    seen: list[np.ndarray] = []
+    found = best_of_all(problem, problem.criterion, lambda matrix: float(seen.append(matrix) or 0.0))
+    assert found is not None and found.rows.tolist() == [2, 3]
+    assert len(seen) == 4  # three pairs of the first three, and the last two
+    whole = ChoiceProblem(rows[:3], Determinant(), np.zeros((P, P)), 2)
+    nothing = best_of_all(whole, whole.criterion, lambda matrix: 0.0)
+    assert nothing is not None and nothing.log_value == -np.inf
+    monkeypatch.setattr(enumeration, "MOST_SINGULAR", 4)
+    assert best_of_all(problem, problem.criterion, lambda matrix: 0.0) is not None
+    for most in (1, 3):
+        monkeypatch.setattr(enumeration, "MOST_SINGULAR", most)
+        assert best_of_all(problem, problem.criterion, lambda matrix: 0.0) is None
+
+
+@pytest.mark.parametrize("share", [0.5, 2.0])
+def test_a_matrix_is_singular_by_its_correlations_whatever_the_units(share: float) -> None:
+    """[[1, c], [c, 1]] has the eigenvalues 1 − c and 1 + c."""
+    ratio = share * enumeration.REGULAR
+    c = (1.0 - ratio) / (1.0 + ratio)
+    units = np.array([[1e-3, 1e3], [1.0, 1.0], [1e4, 7.0]])
+    matrices = np.array([[1.0, c], [c, 1.0]]) * units[:, :, None] * units[:, None, :]
+    assert enumeration._singular(matrices).tolist() == [share < 1.0] * 3
+
+
+def test_the_time_that_all_choices_take_is_told_from_their_multiplications() -> None:
+    """By hand, for p = 100 and ten configurations of three rows among twelve candidates."""
+    problem = ChoiceProblem(np.broadcast_to(0.0, (12, 3, 100)), Determinant(), np.eye(100), 10)
+    alone = 66 * (1e-5 + 1.5e-10 * (6e6 + 3e5))
+    shared = 66 * (1.5e-4 + 1.5e-10 * (6e6 + 3e5 + 2.7e4 + 900 * 130))
+    assert seconds(problem) == pytest.approx(alone, rel=1e-12)
+    together = replace(problem, together=object())  # type: ignore[arg-type]
+    assert seconds(together) == pytest.approx(shared, rel=1e-12)
+    assert seconds(replace(together, beside=(together, together))) == pytest.approx(3 * shared, rel=1e-12)
+    assert seconds(replace(problem, repeat=True)) == pytest.approx(alone * comb(21, 10) / 66, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", ["d", "a", "d, whole error model", "a, whole error model"])

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from itertools import combinations, combinations_with_replacement
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from robots import mixed, random_configurations
 from calib_planner import InputError, PlanProblem, Robot
 from calib_planner.planning import Custom, Feasibility, InformationModel, plan_space, random_plans
 from calib_planner.planning.criteria import Determinant, log_values, ridged
+from calib_planner.planning.search import enumeration
 from calib_planner.planning.search.apart import nearest, repelling
 from calib_planner.planning.search.descent import (
     _direction,
@@ -164,12 +166,17 @@ def test_places_of_a_design_are_taken_together_the_heaviest_first() -> None:
     assert heaviest_places(support, weights, np.array([1.0, 2.0])).tolist() == [2, 3, 0, 5]
 
 
-def test_every_choice_comes_once() -> None:
-    rows = np.random.default_rng(0).normal(size=(6, 3, 4))
+@pytest.mark.parametrize("together", [None, object()], ids=["alone", "together"])
+def test_every_choice_comes_once(together: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many at once as there is memory for: 3·4² numbers a choice, or 3·(4 + 3·3)² with shared errors."""
+    monkeypatch.setattr(enumeration, "BATCH", 1100)
+    rows, many = np.random.default_rng(0).normal(size=(6, 3, 4)), 22 if together is None else 2
     for repeat, every in ((False, combinations), (True, combinations_with_replacement)):
-        problem = ChoiceProblem(rows, Determinant(), np.eye(4), 3, repeat=repeat)
-        choices = [tuple(row) for batch in _batches(problem) for row in batch.tolist()]
+        problem = ChoiceProblem(rows, Determinant(), np.eye(4), 3, repeat=repeat, together=together)
+        batches = [batch.tolist() for batch in _batches(problem)]
+        choices = [tuple(row) for batch in batches for row in batch]
         assert choices == list(every(range(6), 3)) and len(choices) == choices_of(problem)
+        assert {len(batch) for batch in batches[:-1]} <= {many} and len(batches) == -(-len(choices) // many)
 
 
 def test_a_plan_is_drawn_from_the_design_and_completed_by_others() -> None:

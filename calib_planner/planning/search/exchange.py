@@ -283,9 +283,14 @@ def log_values_of(problem: ChoiceProblem, matrices: FloatArray) -> FloatArray:
 
 
 def slightly_ridged(matrices: FloatArray) -> FloatArray:
-    """(S, p, p) with 1e-13 more on the diagonal, relative to each element of it."""
+    """(S, p, p) with 1e-13 more on the diagonal, relative to each element of it, or to the largest where it is 0.
+
+    It is 0 where no row shows a parameter at all, as in plans that stay at the home configuration.
+    """
     diagonal = np.einsum("sii->si", matrices)
-    return np.asarray(matrices + 1e-13 * diagonal[:, :, None] * np.eye(matrices.shape[-1]))
+    largest = diagonal.max(axis=1, keepdims=True)
+    scale = np.where(diagonal > 0.0, diagonal, np.where(largest > 0.0, largest, 1.0))
+    return np.asarray(matrices + 1e-13 * scale[:, :, None] * np.eye(matrices.shape[-1]))
 
 
 # ── determinants: all candidates, exactly ────────────────────────────────────────────────────────────
