@@ -140,7 +140,7 @@ def test_joint_range():
 
 
 def plain(robot, q):
-    """Per configuration: what the constraints below ask, one configuration, target and link at a time."""
+    """Per configuration: by how much it keeps the constraints below, one target and link at a time."""
     radii = Capsules().of(robot)
     near = radii[:-1].max()
     for row in q:
@@ -151,29 +151,57 @@ def plain(robot, q):
         for p in robot.positions(row)[0]:
             beam = p - STATION
             d = np.linalg.norm(beam)
-            seen.append(2.0 <= d <= 4.5 and -0.1 <= np.arctan2(beam[2], np.hypot(*beam[:2])) <= 0.4)
-            facing.append(np.arccos(np.clip(rotation[:, 0] @ -beam / d, -1, 1)) <= 1.0)
+            elevation = np.arctan2(beam[2], np.hypot(*beam[:2]))
+            seen += [d - 2.0, 4.5 - d, elevation + 0.1, 0.4 - elevation]
+            facing.append(np.cos(np.arccos(np.clip(rotation[:, 0] @ -beam / d, -1, 1))) - np.cos(1.0))
             share = np.linspace(0, 1, 161)
             on_beam = STATION + share[:, None] * (beam * max(0.0, 1 - near / d))
             for k, (a, b) in enumerate(pairwise(nodes[:-1])):
                 on_link = a + share[:, None] * (b - a)
                 gap = np.linalg.norm(on_beam[:, None] - on_link[None], axis=2).min()
                 clear.append(gap - radii[k])
-        yield all(seen), all(facing), min(clear)
+        yield seen, facing, clear
 
 
 @pytest.mark.parametrize("case", ["kuka_kr270", "mixed lengths+offsets"])
 def test_against_plain_loops(case):
     robot = CASES[case]()
-    q = random_configurations(robot, 150, 5)
+    q = random_configurations(robot, 60, 5)
+    posture = robot.posture(q)
     seen, facing, clear = (np.array(column) for column in zip(*plain(robot, q), strict=True))
     range_, elevation = TrackerRange(STATION, 2.0, 4.5), TrackerElevation(STATION, low=-0.1, high=0.4)
-    np.testing.assert_array_equal(range_.allowed(robot, q) & elevation.allowed(robot, q), seen)
-    np.testing.assert_array_equal(ReflectorAcceptance(STATION, [1, 0, 0], 1.0).allowed(robot, q), facing)
-    found = LineOfSight(STATION).allowed(robot, q)
-    sure = np.abs(clear) > 0.05  # the loop's grid overestimates gaps by less than this
+    cone, sight = ReflectorAcceptance(STATION, [1, 0, 0], 1.0), LineOfSight(STATION)
+    both = np.concatenate([part.margins(robot, posture) for part in (range_, elevation)], axis=1)
+    np.testing.assert_allclose(np.sort(both), np.sort(seen), atol=1e-12)
+    np.testing.assert_array_equal(range_.allowed(robot, q) & elevation.allowed(robot, q), (seen >= 0).all(axis=1))
+    np.testing.assert_allclose(cone.margins(robot, posture), facing, atol=1e-12)
+    np.testing.assert_array_equal(cone.allowed(robot, q), (facing >= 0).all(axis=1))
+    over = np.sort(clear) - np.sort(sight.margins(robot, posture))
+    assert over.min() > -1e-9 and over.max() < 0.05  # the loop's grid overestimates gaps by less than this
+    found, clear = sight.allowed(robot, q), clear.min(axis=1)
+    sure = np.abs(clear) > 0.05
     np.testing.assert_array_equal(found[sure], clear[sure] > 0)
     assert 0.1 < found.mean() < 1.0 and sure.mean() > 0.5
+
+
+@pytest.mark.parametrize("case", ["kuka_kr270", "mixed lengths+offsets"])
+def test_margins_of_box_and_floor_are_distances(case):
+    robot = CASES[case]()
+    q = random_configurations(robot, 20, 6)
+    posture, up = robot.posture(q), np.array([0.6, 0.0, 0.8])
+    radii = np.arange(1.0, len(robot.joint_names) + 2.0) / 10.0
+    box = WorkspaceBox([-1.0, -np.inf, 0.2], [np.inf, 2.0, 1.5], tip=True)
+    floor = MinimumHeight(0.3, 2.0 * up, Capsules(radii))
+    inside, above = (part.margins(robot, posture) for part in (box, floor))
+    assert np.isfinite(inside).all()
+    for n in range(len(q)):
+        targets, tip = robot.positions(q[n])[0], posture.tip_origin[n]
+        sides = [(x + 1.0, 2.0 - y, z - 0.2, 1.5 - z) for x, y, z in (*targets, tip)]
+        np.testing.assert_allclose(np.sort(inside[n]), np.sort(np.ravel(sides)), atol=1e-12)
+        heights = [up @ target for target in targets]
+        for k, origin in enumerate((*posture.joint_origins[n, 1:], tip), 1):  # at the end of capsule k
+            heights.append(up @ origin - radii[k : k + 2].max())
+        np.testing.assert_allclose(np.sort(above[n]), np.sort(heights) - 0.3, atol=1e-12)
 
 
 def test_the_frame_is_that_of_positions():
@@ -365,7 +393,7 @@ def test_a_plan_satisfies_every_constraint(constrained):
     assert ((elevation >= -0.8) & (elevation <= 1.0)).all()
     facing = np.einsum("ni,ni->n", posture.tip_rotation[:, :, 0], -beams) / d
     assert (facing >= np.cos(np.pi / 6) - 1e-12).all()
-    assert all(clear > -1e-9 for _, _, clear in plain(robot, q))
+    assert all(min(clear) > -1e-9 for _, _, clear in plain(robot, q))
 
 
 def test_the_bound_holds_for_feasible_plans(constrained):
