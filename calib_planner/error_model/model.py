@@ -162,7 +162,10 @@ class ErrorModel:
         """The same without ``gravity``, ``joint_functions``, ``visits`` or one component of the second."""
         if self.joint_functions is not None and term in self.joint_functions.components:
             left = tuple(c for c in self.joint_functions.components if c != term)
-            return replace(self, joint_functions=JointFunctions(left) if left else None)
+            if not left:
+                return replace(self, joint_functions=None)
+            needed = min(JointFunctions(left).harmonics, self.joint_functions.harmonics)
+            return replace(self, joint_functions=JointFunctions(left, needed))
         changes: dict[str, Any] = {term: None}
         if term not in OPTIONAL_TERMS:
             raise UnknownNameError("term", term, (*OPTIONAL_TERMS, "smooth", "short"))
