@@ -26,6 +26,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import IO, Any
 
 LONGEST = 1 << 17
@@ -33,6 +34,8 @@ LONGEST = 1 << 17
 NODES = "calib_planner.ros.nodes"
 AS_MAIN = (NODES + ".", "calib_planner.ros.processes", "calib_planner.ros.demo")
 """What commands run as ``__main__``: not there by its own name, as it is not in a process of its own."""
+LEFT = "the middleware's participant outlives the program:"
+"""What is said when Python ends with a participant at work: Fast DDS may hang or crash when its library ends."""
 
 
 class Forked:
@@ -206,6 +209,15 @@ def serve(control: socket.socket) -> dict[str, Any]:
         os.write(status_pipe, b"%d\n" % pid)
 
 
+def participant_threads() -> list[str]:
+    """The threads of Fast DDS's participants in this process, by name."""
+    names = []
+    for path in Path("/proc/self/task").glob("*/comm"):
+        with suppress(OSError):  # it has just ended
+            names.append(path.read_text().strip())
+    return sorted(name for name in names if name.startswith("dds.") and name != "dds.shm.wdog")
+
+
 def told(pipe: int, status: int) -> None:
     """Tell the exit status; nobody may listen any more."""
     with suppress(BrokenPipeError):
@@ -226,7 +238,11 @@ def main() -> None:
     os.environ.clear()
     os.environ.update(job["env"])
     module, *sys.argv[1:] = job["words"]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    finally:
+        if threads := participant_threads():
+            print(LEFT, *threads, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from robots import repeats
-from warm_processes import Warm
+from warm_processes import LEFT, Warm
 
 from calib_planner.errors import CalibPlannerError
 from calib_planner.ros import processes
@@ -90,7 +90,7 @@ def test_every_node_ends_with_status_0(warm: Warm, tmp_path: Path, number: signa
         nodes.check()
         assert nodes.end(number) == dict.fromkeys(node_names(), 0), nodes.logs()
     for log in logs:
-        assert "Traceback" not in log.read_text(), log.read_text()
+        assert "Traceback" not in log.read_text() and LEFT not in log.read_text(), log.read_text()
 
 
 INTERRUPTED = """

@@ -11,7 +11,9 @@ executor then raises ``InvalidHandle``, although it works again at the next call
 *What is done here.* rclpy's handlers are not installed. A thread of its own waits for signals and wakes the
 executor, which looks whether the process is to end before it sleeps again. Once it ends, further signals are
 ignored: Ctrl-C in a terminal reaches a node twice when ``ros2 launch`` passes it on, too. ``InvalidHandle`` while
-collecting is passed over.
+collecting is passed over. In the end the node is destroyed before Python ends, and the middleware's participant
+with it: else Fast DDS ends it while the libraries of the process end, where it waits for ever, or the process dies,
+if a message of discovery comes just then.
 
 *Upstream.* ros2/rclpy#844 (shutdown by a signal), #1142 and #1206 (``InvalidHandle``, open). This file may go
 when rclpy's handlers leave the context alone until the executor has returned, and when the executor passes over
@@ -85,7 +87,9 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         close = getattr(node, "close", None)
         in_time = close() if close is not None else True
         if ended.executor is not None:
-            ended.executor.shutdown(timeout_sec=LAST_WORDS)
+            in_time = ended.executor.shutdown(timeout_sec=LAST_WORDS) and in_time
+        if node is not None and in_time:
+            node.destroy_node()
         rclpy.try_shutdown()
         if not in_time:
             # Python would wait for the thread that is still at work.
