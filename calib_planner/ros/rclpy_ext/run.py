@@ -12,8 +12,8 @@ executor then raises ``InvalidHandle``, although it works again at the next call
 executor, which looks whether the process is to end before it sleeps again. Once it ends, further signals are
 ignored: Ctrl-C in a terminal reaches a node twice when ``ros2 launch`` passes it on, too. ``InvalidHandle`` while
 collecting is passed over. In the end the node is destroyed before Python ends, and the middleware's participant
-with it: else Fast DDS ends it while the libraries of the process end, where it waits for ever, or the process dies,
-if a message of discovery comes just then.
+with it: else Fast DDS ends it while the libraries of the process end, where it waits for ever, or the process
+dies if a message of discovery comes just then.
 
 *Upstream.* ros2/rclpy#844 (shutdown by a signal), #1142 and #1206 (``InvalidHandle``, open). This file may go
 when rclpy's handlers leave the context alone until the executor has returned, and when the executor passes over
