@@ -9,10 +9,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from robots import random_configurations
+from scipy.stats import chi2
 
 from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.error_model import ErrorModel, JointFunctions, Knowledge, typical
-from calib_planner.identification import solver
+from calib_planner.identification import (
+    ChiSquare,
+    LeftOutError,
+    ParameterFit,
+    chance_of,
+    solver,
+    without_noise,
+)
+from calib_planner.identification.estimate import residual_statistics
 from calib_planner.identification.rejection import copied_rows, explain, rejected_since
 from calib_planner.identification.solver import (
     _blind_poses,
@@ -141,11 +150,16 @@ def test_what_happened_to_points_that_fit_elsewhere() -> None:
     rejected[6, 1] = True
     points[7, 0] += 0.3
     rejected[7, 0] = True
+    points[5] = points[5, [1, 2, 0]]
+    rejected[5] = True
     words = explain(predicted, Measurements(robot.joint_names, q, points), rejected, 1e-4)
     expected = {
         (1, 0): "fits target 3: targets exchanged?",
         (1, 2): "fits target 1: targets exchanged?",
         (6, 1): "fits the configuration of row 2: rows exchanged?",
+        (5, 0): "fits target 2: targets exchanged?",
+        (5, 1): "fits target 3: targets exchanged?",
+        (5, 2): "fits target 1: targets exchanged?",
     }
     for target in range(3):
         expected[3, target] = "fits the configuration of row 4: rows exchanged?"
@@ -231,3 +245,77 @@ def test_what_the_fit_leaves_counts_configurations_once_and_parameters_by_what_t
     told = 1.0 - np.diag(fit.knowledge.covariance)[:4] / variances
     assert np.isfinite(variances).all() and (told > 0.0).all() and (told < 1.0).all() and told.min() < 0.95
     assert solver._spare(fit) == pytest.approx(3.0 * 8 - told.sum(), rel=1e-9)
+
+
+# ── statistics ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_chance_makes_a_root_mean_square_larger_by_this_factor_once_in_a_hundred() -> None:
+    for freedom in (1.0, 3.0, 7.5, 400.0):
+        assert chi2.sf(freedom * chance_of(freedom) ** 2, freedom) == pytest.approx(0.01, rel=1e-6)
+    assert chance_of(np.inf) == 1.0 and chance_of(0.99) == np.inf
+
+
+def test_the_noise_is_taken_off_a_mean_square() -> None:
+    """Five is what three and four make; by chance it was larger first."""
+    assert without_noise(25.0, 9.0) == pytest.approx(4.0) and without_noise(8.0, 9.0) == 0.0
+    larger = chance_of(12.0) ** 2
+    assert without_noise(25.0 * larger, 9.0, 12.0) == pytest.approx(4.0)
+    part = LeftOutError(4, 1.0, 5.0, 9.0, 5.0, 3.0, 12.0)
+    assert part.robot_rms == pytest.approx(4.0)
+    assert replace(part, rms=5.0 * np.sqrt(larger)).robot_least == pytest.approx(4.0)
+    unknown = replace(part, noise_rms=np.nan)
+    assert unknown.robot_rms == 5.0 and unknown.robot_least == pytest.approx(5.0 / np.sqrt(larger))
+
+
+def test_statistics_of_distances_and_of_none() -> None:
+    told = residual_statistics(np.array([3.0, 4.0, 0.0]))
+    assert (told.mean, told.rms, told.max) == pytest.approx((7.0 / 3.0, 5.0 / np.sqrt(3.0), 4.0))
+    nothing = residual_statistics(np.empty(0))
+    assert np.isnan([nothing.mean, nothing.rms, nothing.max]).all()
+
+
+def test_probability_of_a_sum_of_squares() -> None:
+    assert ChiSquare(20.0, 7).probability == pytest.approx(chi2.sf(20.0, 7))
+    assert ChiSquare(2.0, 1).probability == pytest.approx(chi2.sf(2.0, 1))
+    assert np.isnan(ChiSquare(2.0, 0).probability) and np.isnan(ChiSquare(np.nan, 7).probability)
+
+
+def test_correlated_pairs_are_named_the_strongest_first() -> None:
+    """Standard deviations 2, 1, 3 and a fixed parameter; beyond 0.95 in either direction."""
+    unit = np.array([[1.0, 0.96, 0.2, 0.0], [0.96, 1.0, -0.97, 0.0], [0.2, -0.97, 1.0, 0.0], [0.0] * 4])
+    std = np.array([2.0, 1.0, 3.0, 0.0])
+    names, zeros = ("a", "b", "c", "d"), np.zeros(4)
+    fit = ParameterFit(names, ("m",) * 4, zeros, zeros, std, unit * np.outer(std, std), 1, "ok")
+    (one, other) = fit.correlations
+    assert one[:2] == ("b", "c") and one[2] == pytest.approx(-0.97)
+    assert other[:2] == ("a", "b") and other[2] == pytest.approx(0.96)
+
+
+def test_accuracy_at_test_poses_by_its_parts() -> None:
+    robot = kuka("d1,q2,d2,q3")
+    q, poses = random_configurations(robot, 12, 2), random_configurations(robot, 3, 5)
+    points = robot.positions(q) + SIGMA * np.random.default_rng(0).standard_normal((12, 1, 3))
+    data = Measurements(robot.joint_names, q, points)
+    problem = IdentificationProblem(robot, data, SIGMA, ErrorModel.paper(SIGMA), test_poses=poses)
+    estimate = identify(problem)
+    told = estimate.accuracy
+    rows = robot.jacobian(poses, estimate.fit.deviations)
+    expected = np.sqrt(np.trace(rows @ estimate.fit.covariance @ np.swapaxes(rows, 1, 2), axis1=1, axis2=2))
+    np.testing.assert_allclose(told.predicted, expected, rtol=1e-6)
+    np.testing.assert_allclose(told.parameters, expected, rtol=1e-6)
+    assert told.overall == pytest.approx(np.sqrt(np.mean(expected**2))) and told.worst == expected.max()
+    blind = replace(told, predicted=np.array([1.0, np.inf, 1.0]))
+    np.testing.assert_array_equal(np.isinf(blind.parameters), [False, True, False])
+    none = identify(replace(problem, test_poses=None)).accuracy
+    assert np.isnan([none.overall, none.worst]).all() and not none.parameters.size
+    np.testing.assert_allclose(
+        estimate.positions(poses), robot.positions(poses, estimate.fit.deviations), atol=1e-12
+    )
+    values = dict(zip(robot.parameter_names, [p.nominal for p in robot.parameters], strict=True))
+    for name, value, off in zip(
+        estimate.fit.parameters, estimate.fit.values, estimate.fit.deviations, strict=True
+    ):
+        assert value == pytest.approx(values[name] + off)
+    np.testing.assert_allclose(estimate.placement_values, estimate.fit.values, atol=1e-12)
+    assert estimate.noise_source == "as given" and estimate.scale_spread == {}

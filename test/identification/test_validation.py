@@ -115,6 +115,27 @@ def test_statistics_are_those_of_the_distances():
     assert told.noise_rms == pytest.approx(np.sqrt(3.0) * estimate.noise.sigma)
 
 
+def test_a_target_that_was_seated_anew_is_placed_by_the_first_rows_of_its_set():
+    """Offsets by least squares on p = R t + o of the first four rows, of the nominal and the calibrated robot."""
+    problem, held_out, seat = reseated(2)
+    estimate = validate(problem, identify(problem), held_out, seat)
+    frame, lengths = np.vstack([np.zeros(3), np.eye(3)]), {"calibrated": [], "nominal": []}
+    for name, robot in (("calibrated", estimate.calibrated), ("nominal", problem.robot)):
+        for data in held_out:
+            tips = replace(robot, parameter_names=()).with_targets(frame).positions(data.q)
+            turns, origins = (tips[:, 1:] - tips[:, :1]).transpose(0, 2, 1), tips[:, 0]
+            right = (data.p[:seat, 0] - origins[:seat]).ravel()
+            offset = np.linalg.lstsq(turns[:seat].reshape(-1, 3), right, rcond=None)[0]
+            lengths[name].append(
+                np.linalg.norm(data.p[seat:, 0] - origins[seat:] - turns[seat:] @ offset, axis=1)
+            )
+    alone, before = (np.concatenate(lengths[name]) for name in ("calibrated", "nominal"))
+    told = estimate.validation
+    assert told.placement_mean == pytest.approx(alone.mean(), rel=1e-6)
+    assert told.placement_rms == pytest.approx(np.sqrt(np.mean(alone**2)), rel=1e-6)
+    assert told.before_mean == pytest.approx(before.mean(), rel=1e-6) and told.count == 22
+
+
 def test_left_out_errors_are_those_of_fits_without_the_visit():
     """(M4) against one fit of plain least squares a visit, by hand; and what is predicted is achieved."""
     ratios = []
