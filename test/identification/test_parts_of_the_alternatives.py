@@ -18,7 +18,7 @@ from scipy.stats import f as f_distribution
 from calib_planner import Measurements, Robot
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, JointFunctions, Placement, Poses, Prior, joint_units, typical
-from calib_planner.identification import fit_error_model
+from calib_planner.identification import alternatives, fit_error_model
 from calib_planner.identification.alternatives import (
     FULL_FIRST,
     _answer,
@@ -317,15 +317,19 @@ def test_predictions_are_compared_with_what_was_promised_of_them() -> None:
 # ── an alternative in full ───────────────────────────────────────────────────────────────────────────
 
 
-def test_gain_and_movement_of_an_alternative_are_those_of_the_fit_with_its_columns() -> None:
+@cache
+def slipping() -> tuple[Measurements, ModelEstimate]:
     """Joint 4 slips by 3 mrad before visit 10."""
     robot, data = ur10e(), measured()
     q = np.array(data.q)
     q[10:, 3] += 3e-3
-    points = data.p + (robot.positions(q) - robot.positions(data.q))
-    slipped = changed(data, points)
-    fit = fit_error_model(unknown(robot), slipped, SMALL)
-    told = find_alternatives(unknown(robot), slipped, fit, POSES)
+    data = changed(data, data.p + (robot.positions(q) - robot.positions(data.q)))
+    return data, fit_error_model(unknown(robot), data, SMALL)
+
+
+def test_gain_and_movement_of_an_alternative_are_those_of_the_fit_with_its_columns() -> None:
+    slipped, fit = slipping()
+    told = find_alternatives(unknown(ur10e()), slipped, fit, POSES)
     best = told[0]
     assert (best.code, best.joint, best.row, best.unit) == ("joint_step", "wrist_1_joint", 10, "rad")
     assert best.size == pytest.approx(3e-3, rel=0.15) and best.freedom == 1
@@ -345,6 +349,24 @@ def test_gain_and_movement_of_an_alternative_are_those_of_the_fit_with_its_colum
     promised = fit.knowledge.accuracy(POSES).per_pose
     assert best.deviations == pytest.approx((lengths / promised).max(), rel=0.05)
     assert best.material == (best.deviations > 1.0)
+
+
+def test_of_many_visits_one_alternative_is_named_at_the_scales_of_the_estimate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No run of visits is looked for, and what is told follows from the linear problem as it is."""
+    slipped, fit = slipping()
+    monkeypatch.setattr(alternatives, "ENOUGH", 53)  # of 108 coordinates
+    (told,) = find_alternatives(unknown(ur10e()), slipped, fit, POSES)
+    assert (told.code, told.joint, told.row) == ("joint_step", "wrist_1_joint", 10)
+    one = fine(slipped, fit)
+    question = next(x for x in one.questions(fit.solution) if (x.code, x.joint) == ("joint_step", 3)).at(10)
+    wide = solve(_widened(fit.solution.problem, question.columns))
+    assert told.gain == pytest.approx(left_out(wide).score - fit.left_out.score, rel=1e-6)
+    assert told.size == pytest.approx(float(wide.coefficients[-1]), rel=1e-6)
+    statistic = _answer(fit.solution, question, _statistics(fit.solution, [question.columns])[0], 1.0)
+    assert told.statistic == pytest.approx(statistic.statistic, rel=1e-6) and told.freedom == 1
+    assert told.probability == pytest.approx(statistic.probability * 168.0, rel=1e-6)
 
 
 def test_points_that_are_put_back_gain_what_the_fit_to_the_right_points_has() -> None:
@@ -781,6 +803,41 @@ def test_units_are_found_for_a_planar_arm(points: float, angles: float) -> None:
     told = explain_gross(robot, Measurements(robot.joint_names, angles * q, points * p))
     assert told is not None and told.code == "units" and told.material and told.row is None
     assert ("points" in told.text, "angles" in told.text) == (points != 1.0, angles != 1.0)
+
+
+def test_two_mistakes_at_once_are_told_if_one_of_them_is_the_units() -> None:
+    robot, q, p = planar()
+    wrong = column(q, 1, -q[:, 1])
+    for points, angles, text in (
+        (1e3, 1.0, "the points are in millimetres"),
+        (1.0, 57.29577951308232, "in degrees"),
+    ):
+        told = explain_gross(robot, Measurements(robot.joint_names, angles * wrong, points * p))
+        assert told is not None and told.code == "sign" and told.joint == robot.joint_names[1]
+        units, _, rest = told.text.partition(", and ")
+        assert text in units and rest == f"{robot.joint_names[1]} runs the other way than in the robot model"
+        # What is left before is told in metres, and is no more than the points spread.
+        assert 0.05 < told.moved <= 1.001 * _spread(p) and told.statistic > 1e3
+
+
+def test_rows_that_slipped_beside_sound_ones_in_numbers() -> None:
+    """Ten of forty rows have the points of the row behind; the fit to the others leaves 0.1 mm."""
+    robot, q, p = planar(40)
+    rng = np.random.default_rng(0)
+    noisy = p + 1e-4 * rng.standard_normal(p.shape)
+    points = np.array(noisy)
+    points[10:20] = noisy[11:21]
+    told = explain_gross(robot, Measurements(robot.joint_names, q, points))
+    assert told is not None and told.code == "rows" and told.rows == tuple(range(10, 20)) and told.row == 10
+    far = np.median(np.linalg.norm(points[10:20] - p[10:20], axis=2))
+    assert told.moved == pytest.approx(far, rel=0.01) and told.size == told.freedom == 10
+    assert told.statistic == told.deviations == pytest.approx(far / 1.6e-4, rel=0.3)
+    assert told.gain == pytest.approx(-np.log(told.probability)) and not told.material
+    # Less than a tenth of the rows: a robust fit copes with them by itself. And so few as two are no run.
+    few = np.array(noisy)
+    few[10:13] = noisy[11:14]
+    assert explain_gross(robot, Measurements(robot.joint_names, q, few)) is None
+    assert explain_gross(robot, Measurements(robot.joint_names, q, noisy)) is None
 
 
 def test_too_few_visits_or_coordinates_to_spare_explain_nothing() -> None:
