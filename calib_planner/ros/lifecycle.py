@@ -249,7 +249,7 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     def close(self) -> bool:
         """End everything when the process ends; returns whether nothing is under way any more.
 
-        Publishers and services stay, since a thread may be about to use them; they end with the process.
+        Publishers and services stay, since a thread may be about to use them; they are destroyed with the node.
         """
         self._ending = True
         self._leave_all()

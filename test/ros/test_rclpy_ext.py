@@ -143,6 +143,23 @@ def test_run_a_signal_is_seen_too_late_or_ends_the_context(bench: Bench, own: bo
     assert re.fullmatch(order, done.stdout.strip()), (done.stdout, done.stderr)
 
 
+HELD = """
+import ctypes
+from calib_planner.ros.rclpy_ext.run import end_after
+end_after({seconds})
+ctypes.PyDLL(None).sleep({sleep})
+raise SystemExit(7)
+"""
+"""What ``PyDLL`` calls holds the interpreter: no thread of Python could end the process."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a timer of Linux")
+@pytest.mark.parametrize(("seconds", "sleep", "status"), [(0.5, 600, 0), (600, 0, 7)])
+def test_run_a_process_ends_whatever_holds_the_interpreter(seconds: float, sleep: int, status: int) -> None:
+    done = subprocess.run([sys.executable, "-c", HELD.format(seconds=seconds, sleep=sleep)], timeout=120)
+    assert done.returncode == status
+
+
 def test_lifecycle_an_impossible_transition_raises(bench: Bench) -> None:
     node, _ = other(bench, LifecycleNode)
     request = ChangeState.Request(transition=Transition(id=99))

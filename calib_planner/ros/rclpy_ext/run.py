@@ -11,22 +11,29 @@ executor then raises ``InvalidHandle``, although it works again at the next call
 *What is done here.* rclpy's handlers are not installed. A thread of its own waits for signals and wakes the
 executor, which looks whether the process is to end before it sleeps again. Once it ends, further signals are
 ignored: Ctrl-C in a terminal reaches a node twice when ``ros2 launch`` passes it on, too. ``InvalidHandle`` while
-collecting is passed over. In the end the node is destroyed before Python ends, and the middleware's participant
-with it: else Fast DDS ends it while the libraries of the process end, where it waits for ever, or the process
-dies if a message of discovery comes just then.
+collecting is passed over.
+
+*The end.* First the threads of the executor: its ``shutdown`` marks it as shut down and then, for that reason,
+does not wait for them. Then the node is destroyed, and the middleware's participant with it: else Fast DDS ends
+it while the libraries of the process end, and if a message of discovery comes just then, it hangs or the
+process dies. Fast DDS hangs even so, though seldom: the thread that takes the listener away holds a lock again
+and again for which the thread that has such a message waits. It holds Python's interpreter, too; so a timer of
+the system ends the process after ``LONGEST_END``.
 
 *Upstream.* ros2/rclpy#844 (shutdown by a signal), #1142 and #1206 (``InvalidHandle``, open). This file may go
-when rclpy's handlers leave the context alone until the executor has returned, and when the executor passes over
-what was destroyed while it collected.
+when rclpy's handlers leave the context alone until the executor has returned, when the executor passes over
+what was destroyed while it collected, and when a process may end with a node at work.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -42,8 +49,10 @@ from rclpy.signals import SignalHandlerOptions
 
 from calib_planner.errors import CalibPlannerError
 
-LAST_WORDS = 1.0
-"""Time for answers that are being sent when the process ends [s]."""
+LONGEST_END = 3.0
+"""Time for answers that are being sent, and for the middleware, when the process ends [s]; 0.1 s is enough."""
+SIGEV_THREAD = 2
+"""A timer that calls a function in a thread of its own, in the numbers of Linux."""
 
 
 def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = None) -> int:
@@ -86,14 +95,49 @@ def run(make: Callable[[], Node], threads: int, args: Sequence[str] | None = Non
         ended.is_heard()
         close = getattr(node, "close", None)
         in_time = close() if close is not None else True
-        if ended.executor is not None:
-            in_time = ended.executor.shutdown(timeout_sec=LAST_WORDS) and in_time
-        if node is not None and in_time:
-            node.destroy_node()
-        rclpy.try_shutdown()
         if not in_time:
             # Python would wait for the thread that is still at work.
             os._exit(0)
+        end_after(LONGEST_END)
+        if ended.executor is not None:
+            ended.executor.shutdown()
+            if isinstance(ended.executor, MultiThreadedExecutor):
+                ended.executor._executor.shutdown(cancel_futures=True)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+class _Event(ctypes.Structure):
+    """``struct sigevent`` of Linux: 64 bytes, whatever the event is."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("kind", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("unused", ctypes.c_char * 32),
+    )
+
+
+class _Times(ctypes.Structure):
+    """``struct itimerspec``: interval and time to wait, in seconds and nanoseconds."""
+
+    _fields_ = tuple((name, ctypes.c_long) for name in ("every", "every_ns", "seconds", "nanoseconds"))
+
+
+def end_after(seconds: float) -> None:
+    """End this process with status 0 after so many seconds, even if C code holds Python's interpreter then."""
+    if sys.platform != "linux":
+        return
+    system = ctypes.CDLL(None)
+    event = _Event(kind=SIGEV_THREAD, function=ctypes.cast(system._exit, ctypes.c_void_p))
+    timer = ctypes.c_void_p()
+    if system.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
+        whole = int(seconds)
+        times = _Times(seconds=whole, nanoseconds=int(1e9 * (seconds - whole)))
+        system.timer_settime(timer, 0, ctypes.byref(times), None)
 
 
 class Ended:
