@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from robots import mixed, random_chain, random_configurations
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 from calib_planner import Robot
-from calib_planner.robot import Coupling, Goals, goals_of, residuals, solve
+from calib_planner.robot import Coupling, Element, Goals, goals_of, residuals, solve
 from calib_planner.robot.elements import rotation
 from calib_planner.robot.inverse import LONGEST_STEP, _best_of_each, _residual_and_jacobian, _step, _unwound
 
@@ -171,3 +171,35 @@ def test_the_arm_bends_from_its_stretched_posture_to_whichever_side_is_free() ->
     ends = solve(robot, Goals(np.zeros(3), xyz, None, LEVER), q, low, high)
     np.testing.assert_allclose(np.abs(ends[:, 1]), bend, atol=1e-9)
     assert ends[1, 1] > 0 > ends[2, 1]
+
+
+@pytest.mark.parametrize("size", [1.0, 20.0])
+@pytest.mark.parametrize("first", [2.0, -1.0, 0.3])
+def test_of_the_ways_to_bend_one_of_nearly_least_motion_is_taken(size: float, first: float) -> None:
+    """Three links, stretched out, that shall reach a little less far: SciPy minimises the motion itself."""
+    lengths = size * np.array([1.0, 0.8, 0.5])
+    links = [e for k, x in enumerate(lengths) for e in (Element("Rz", joint=k), Element("Tx", x))]
+    robot = Robot("arm", tuple(links), (), ("a", "b", "c"), np.array([[-9.0, 9.0]] * 3))
+    robot = robot.with_targets([[0.0, 0.0, 0.0]])
+    start, wide = np.array([[first, 0.0, 0.0]]), np.full((1, 3), 9.0)
+    xyz = 0.999 * robot.positions(start)[0]
+    end = solve(robot, Goals(np.zeros(3), xyz, None, LEVER), start, -wide, wide)
+    np.testing.assert_allclose(robot.positions(end)[0], xyz, atol=1e-11)
+    gap = {"type": "eq", "fun": lambda q: (robot.positions(q)[0, 0, :2] - xyz[0, :2]) / size}
+    least = minimize(
+        lambda q: np.sum((q - start[0]) ** 2), end[0], method="SLSQP", constraints=[gap], options={"ftol": 1e-14}
+    )
+    assert np.linalg.norm(end - start) < 1.1 * np.sqrt(least.fun) + 1e-9
+    assert np.abs(gap["fun"](least.x)).max() < 1e-8 and least.fun > 1e-3
+
+
+def test_where_nothing_is_gained_nothing_moves() -> None:
+    """Out of reach: the arm stretches towards the goal, and a roll that brings it no closer stays."""
+    links = (Element("Rz", joint=0), Element("Tx", 1.0), Element("Rz", joint=1), Element("Tx", 0.8))
+    robot = Robot("arm", (*links, Element("Rx", joint=2)), (), ("a", "b", "roll"), np.array([[-4.0, 4.0]] * 3))
+    robot = robot.with_targets([[0.0, 0.0, 0.0]])
+    start, low, high = (np.array([[a, b, c]]) for a, b, c in ((0.5, 0.3, 0.7), (-4, -4, 0.69), (4, 4, 0.71)))
+    goals = Goals(np.zeros(3), np.array([[0.0, 1.9, 0.0]]), None, LEVER)
+    end = solve(robot, goals, start, low, high)
+    np.testing.assert_allclose(end, [[np.pi / 2, 0.0, 0.7]], atol=1e-5)
+    assert np.linalg.norm(residuals(robot, goals, end)) == pytest.approx(0.1, rel=1e-9)
