@@ -31,6 +31,7 @@ def test_base_and_targets_come_first_and_of_dependent_ones_the_first_stay() -> N
     expected[1, [4, 2, 3]] = 1.0, -1.0, 3.0
     expected[2, 6] = 1.0
     np.testing.assert_allclose(seen.directions, expected, atol=1e-9)
+    np.testing.assert_array_equal(seen.directions != 0, expected != 0)
     np.testing.assert_allclose(matrix @ seen.directions.T, 0.0, atol=1e-12)
     assert seen.combinations == ("1·q1 - 2·base.rz", "1·q2 - 1·d1 + 3·d2", "q3")
 
@@ -51,6 +52,7 @@ def test_fewer_equations_than_parameters_free_no_more_than_there_are() -> None:
     matrix = np.random.default_rng(1).normal(size=(3, 7))
     seen = analyse(matrix, NAMES)
     assert seen.free == (1, 5, 0) and len(seen.fixed) == 4
+    assert analyse(matrix, NAMES, tolerance=0.0).free == seen.free
     np.testing.assert_allclose(matrix @ seen.directions.T, 0.0, atol=1e-9)
     nothing = analyse(np.zeros((6, 7)), NAMES)
     assert nothing.rank == 0 and nothing.fixed == (1, 5, 0, 2, 3, 4, 6)
@@ -72,7 +74,19 @@ def test_how_little_is_nothing() -> None:
         assert analyse(matrix, names, tolerance=1e-12, shortest=factor * rest * [0.0, 0.0, 1.0]).free == free
     for size, free in ((0.5e-12, (0, 1)), (2e-12, (0, 1, 2))):
         matrix[:, 2] = size * np.where(np.arange(10) % 2, 1.0, -1.0)
-        assert analyse(matrix, names).free == free
+        for tolerance in (1e-6, 1e-14):
+            assert analyse(matrix, names, tolerance).free == free
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.9e-4, "1·q3 - 1·d1"), (1.2e-4, "1·q3 - 1·d1 - 0.00012·d2")])
+def test_shares_that_are_not_worth_a_word(share: float, said: str) -> None:
+    """Of unit columns: d1 and d2 move the points by millimetres per unit, q3 as d1 does and a little as d2."""
+    matrix = np.random.default_rng(3).normal(size=(30, 3))
+    matrix *= 1e-3 / np.linalg.norm(matrix, axis=0)
+    matrix[:, 2] = matrix[:, 0] + share * matrix[:, 1]
+    seen = analyse(matrix, ("d1", "d2", "q3"))
+    assert seen.combinations == (said,)
+    np.testing.assert_allclose(seen.directions, [[-1.0, -share, 1.0]], rtol=1e-9)
 
 
 def test_a_combination_in_words() -> None:
