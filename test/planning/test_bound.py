@@ -10,6 +10,7 @@ import itertools
 import numpy as np
 import pytest
 from robots import mixed, random_chain, random_configurations, repeats
+from scipy.optimize import minimize
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
 from calib_planner.error_model import Prior
@@ -22,6 +23,7 @@ from calib_planner.planning.bound import (
     maximised,
     raised,
 )
+from calib_planner.planning.certify import branch_and_bound
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, square_root
@@ -258,6 +260,92 @@ def test_what_is_proven_when_time_is_up_still_holds():
     for t, axis in zip(exact.where, axes, strict=True):
         value = np.tensordot(axis.harmonics(np.array([t]))[0], value, 1)
     assert value == pytest.approx(exact.largest, rel=1e-10)
+
+
+def values_of(axes, tensor, t):
+    """(N,) of the polynomial at t (N, k), harmonic by harmonic."""
+    values = np.broadcast_to(tensor, (len(t), *tensor.shape))
+    for k, axis in enumerate(axes):
+        values = np.einsum("na,na...->n...", axis.harmonics(t[:, k]), values)
+    return values
+
+
+SHAPES = {
+    "turn": [(-3.0, 3.1, True)],
+    "slide": [(-0.5, 0.9, False)],
+    "narrow": [(0.2, 0.5, True), (2.0, 2.1, True)],
+    "both": [(-2.5, 2.0, True), (0.3, 1.1, False)],
+    "three": [(-1.0, 0.5, True), (-0.2, 0.2, False), (0.4, 3.0, True)],
+}
+
+
+def random_polynomial(shape, seed):
+    axes = tuple(Axis.of(*limits) for limits in SHAPES[shape])
+    tensor = np.random.default_rng(seed).normal(size=[5 if a.turns else 3 for a in axes])
+    tensor.flat[0] = 1.1 * np.abs(tensor).sum()  # no harmonic is larger than one: nowhere negative
+    return axes, tensor
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("seed", range(2))
+def test_the_maximum_of_a_polynomial_is_enclosed(shape, seed, monkeypatch):
+    """By a fine grid, polished; also when boxes come singly or are too many for the memory."""
+    axes, tensor = random_polynomial(shape, seed)
+    low, high = (np.array([getattr(a, k) for a in axes]) for k in ("low", "high"))
+    count = {1: 2001, 2: 101, 3: 31}[len(axes)]
+    grid = np.meshgrid(*[np.linspace(a.low, a.high, count) for a in axes], indexing="ij")
+    t = np.stack([g.ravel() for g in grid], axis=-1)
+    values = values_of(axes, tensor, t)
+    starts = t[np.argsort(-values)[:3]]
+    bounds = list(zip(low, high, strict=True))
+    ends = [
+        minimize(lambda x: -values_of(axes, tensor, x[None])[0], x, bounds=bounds, options={"ftol": 1e-15}).x
+        for x in starts
+    ]
+    top = max(values.max(), values_of(axes, tensor, np.clip(ends, low, high)).max())
+    for tolerance in (1e-2, 1e-6):
+        found = maximise(axes, tensor, 0.0, tolerance=tolerance)
+        assert not found.late and found.boxes >= np.prod([len(a.pieces[0]) for a in axes])
+        assert found.upper >= top * (1 - 1e-13)
+        assert found.largest <= found.upper <= found.largest * (1 + tolerance) * (1 + 1e-13)
+        assert found.largest <= top * (1 + 1e-9)
+        assert ((low - 1e-12 <= found.where) & (found.where <= high + 1e-12)).all()
+        assert values_of(axes, tensor, found.where[None])[0] == pytest.approx(found.largest, rel=1e-12)
+    known = maximise(axes, tensor, top, tolerance=1e-2)
+    assert known.largest == top or known.largest == pytest.approx(top, rel=1e-9)
+    assert known.boxes <= maximise(axes, tensor, 0.0, tolerance=1e-2).boxes
+    with monkeypatch.context() as patched:
+        patched.setattr(branch_and_bound, "CHUNK", tensor.size)
+        singly = maximise(axes, tensor, 0.0, tolerance=1e-6)
+        assert singly.upper >= top * (1 - 1e-13) and singly.upper <= singly.largest * (1 + 1e-6) * (1 + 1e-13)
+        patched.setattr(branch_and_bound, "MEMORY", 3 * tensor.size)
+        crowded = maximise(axes, tensor, 0.0, tolerance=1e-6)
+        assert crowded.upper >= top * (1 - 1e-13) and crowded.upper <= crowded.largest * (1 + 1e-6) * (1 + 1e-13)
+
+
+def test_work_is_counted_in_coefficients_and_what_is_found_by_then_holds():
+    axes, tensor = random_polynomial("three", 1)
+    whole = maximise(axes, tensor, 0.0, tolerance=1e-6)
+    first = int(np.prod([len(a.pieces[0]) for a in axes]))
+    enough = maximise(axes, tensor, 0.0, tolerance=1e-6, most_work=whole.boxes * tensor.size)
+    assert not enough.late and enough.boxes == whole.boxes
+    for share in (0.0, 0.1, 0.5):
+        most = share * whole.boxes * tensor.size
+        early = maximise(axes, tensor, 0.0, tolerance=1e-6, most_work=most)
+        assert early.late and early.upper >= whole.largest and first <= early.boxes <= whole.boxes
+        assert share == 0.0 or early.boxes * tensor.size > most
+        assert early.upper <= maximise(axes, tensor, 0.0, tolerance=1e-6, most_work=0).upper
+    assert maximise(axes, tensor, 0.0, tolerance=1e-6, time_limit=0.0).late
+
+
+def test_a_polynomial_without_joints_is_its_own_maximum_and_no_tolerance_ends_at_rounding():
+    found = maximise((), np.array(2.5), 1.0, tolerance=1e-6)
+    assert (found.upper, found.largest, found.boxes, found.late) == (2.5, 2.5, 1, False)
+    known = maximise((), np.array(2.5), 3.0, tolerance=1e-6)
+    assert (known.upper, known.largest, known.where) == (3.0, 3.0, None)
+    axes, tensor = random_polynomial("turn", 0)
+    exact = maximise(axes, tensor, 0.0, tolerance=0.0)
+    assert not exact.late and exact.largest <= exact.upper <= exact.largest * (1 + 1e-14)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -18,7 +18,7 @@ NAMES = ("a", "b", "c", "d")
 
 def test_one_mass_for_each_joint_at_the_common_centre_of_gravity() -> None:
     rng = np.random.default_rng(0)
-    joints, weights, places = [2, 0, 2, 2, 3], rng.uniform(0.5, 4.0, 5), rng.normal(size=(5, 3))
+    joints, weights, places = [2, 0, 2, 2, 3], rng.uniform(0.1, 0.9, 5), rng.normal(size=(5, 3))
     masses = [LinkMass(j, w, tuple(xyz)) for j, w, xyz in zip(joints, weights, places, strict=True)]
     found = lumped([*masses, LinkMass(1, 0.0, (1.0, 1.0, 1.0)), LinkMass(2, 0.0, (9.0, 9.0, 9.0))])
     assert [part.joint for part in found] == [0, 2, 3]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from calib_planner import FileFormatError, InputError
+from calib_planner import FileFormatError, InputError, UnknownNameError
 from calib_planner.robot import check_joint_names, grouped, is_nuisance, role_of, target_parameters
 from calib_planner.robot.parameters import BASE_PARAMETERS, resolve_parameters
 
@@ -54,6 +54,12 @@ def test_names_of_targets_count_from_one() -> None:
 )
 def test_a_request(request_: str | list[str], unknown: tuple[str, ...], names: list[str]) -> None:
     assert resolve_parameters(request_, unknown, AVAILABLE, LEVELS, 2) == tuple(names)
+
+
+@pytest.mark.parametrize("word", ["", "axis", "bas", "basement", "lengths", "to", "tools", "zero"])
+def test_only_base_and_tool_may_be_unknown(word: str) -> None:
+    with pytest.raises(UnknownNameError, match="base, tool"):
+        resolve_parameters("lengths", (word,), AVAILABLE, LEVELS, 2)
 
 
 @pytest.mark.parametrize(
