@@ -297,6 +297,11 @@ class Measuring:
         self._execution.poll(self._settings.silence)
         self._execution.cancel()
 
+    def end(self, seconds: float) -> None:
+        """``leave``, and wait until the robot's node has answered, at most so long [s]."""
+        self.leave()
+        self._execution.insist(seconds)
+
     def tell_fit(self, state: CampaignState) -> None:
         """Tell the identifier a plan of everything that is measured for the fit.
 

@@ -12,6 +12,7 @@ in the executor's thread.
 
 from __future__ import annotations
 
+import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from calib_planner.robot import Robot
 from calib_planner.ros.lifecycle import ManagedNode
 from calib_planner.ros.messages import duration_message, seconds_of
 from calib_planner.ros.parameters import LATCHED
+from calib_planner.ros.rclpy_ext.polling import take_answers
 from calib_planner.units import cut
 
 ACTION = "~/execute_plan"
@@ -36,6 +38,10 @@ LONGEST_DWELL = 600.0
 """Length of a standstill, at most [s]."""
 MOST_STANDSTILLS = 100_000
 """Standstills of one plan, at most; at a second each that is more than a day."""
+AGAIN = 0.3
+"""A request to cancel that is not answered is sent again after this time [s]; an answer takes milliseconds."""
+LOOK = 0.01
+"""Time between two looks for an answer [s]."""
 
 
 def check_executable(plan: Plan, robot: Robot) -> None:
@@ -143,6 +149,7 @@ class PlanExecution:
         self._ended: Ended | None = None
         self._heard = 0.0
         self._begun = self._cancelling = False
+        self._answers: list[Any] = []
 
     @property
     def ready(self) -> bool:
@@ -173,7 +180,25 @@ class PlanExecution:
             return
         self._cancelling = True
         self._heard = self._node.seconds
+        self._answers = []
         self._cancel(self._goal)
+
+    def insist(self, seconds: float) -> None:
+        """Cancel again until that is answered, at most so long [s], where no executor listens.
+
+        For the end of a node: a request that is under way when its client is destroyed may be lost.
+        """
+        now = sent = time.monotonic()
+        until = now + seconds
+        while self._goal is not None and self._cancelling and now < until:
+            take_answers(self._canceller)
+            if any(future.done() for future in self._answers):
+                return
+            if now - sent > AGAIN:
+                sent = now
+                self._cancel(self._goal)
+            time.sleep(LOOK)
+            now = time.monotonic()
 
     def poll(self, silence: float) -> Ended | None:
         """How the goal ended, told once; ``None`` while it runs.
@@ -218,4 +243,4 @@ class PlanExecution:
         request = CancelGoal.Request()
         request.goal_info.goal_id = name
         if self._canceller.service_is_ready():
-            self._canceller.call_async(request)
+            self._answers.append(self._canceller.call_async(request))

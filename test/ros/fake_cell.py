@@ -59,7 +59,7 @@ class FakeCell(Node):
         self.plans: list[PlanMessage] = []
         self.untold: list[tuple[np.ndarray, dict[str, object]]] = []
         self.visited: list[np.ndarray] = []
-        self.number = self.stopped = 0
+        self.number = self.stopped = self.cancels = 0
         self.closing = threading.Event()
         self._plan: PlanMessage | None = None
         self._rng = np.random.default_rng(1)
@@ -72,12 +72,16 @@ class FakeCell(Node):
             "tracker_simulator/execute_plan",
             self._execute,
             callback_group=ReentrantCallbackGroup(),
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
         )
 
     def close(self) -> None:
         self.closing.set()
         self._server.destroy()
+
+    def _on_cancel(self, goal: object) -> CancelResponse:
+        self.cancels += 1
+        return CancelResponse.ACCEPT
 
     def _on_plan(self, message: PlanMessage) -> None:
         self.plans.append(message)

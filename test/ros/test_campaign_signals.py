@@ -7,19 +7,29 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from bench import Bench
+from calib_planner_msgs.action import ExecutePlan
 from desk import ASKED, Desk, S
 from fake_cell import FakeCell
-from robots import repeats
+from robots import plan_of, random_configurations, repeats
 from warm_processes import Warm
 
 from calib_planner import Robot
 from calib_planner.io import open_campaign
+from calib_planner.ros.executor import PlanExecution
+from calib_planner.ros.lifecycle import LifecycleParameters, ManagedNode
+from calib_planner.ros.messages import plan_to_message
 from calib_planner.ros.processes import Nodes
 
 NODE = "campaign_node"
+
+
+class Client(ManagedNode[LifecycleParameters]):
+    def __init__(self, **options: Any) -> None:
+        super().__init__("execution_client", LifecycleParameters(), **options)
 
 
 class Restarts:
@@ -75,6 +85,7 @@ def test_told_to_end_the_robot_stops_and_a_restart_goes_on(
     told = desk.until(S.MEASURING, 60.0, measured=4)
     bench.wait(lambda: len(cell.visited) == 5)
     runs.end(number)
+    assert cell.cancels, "the node ended before the robot's had heard that it is to stop"
     bench.wait(lambda: cell.stopped == 1)
     assert runs.measured() == [1, 2, 3, 4]
 
@@ -93,3 +104,23 @@ def test_told_to_end_the_robot_stops_and_a_restart_goes_on(
     assert done.outcome == S.OUTCOME_REACHED and done.campaign_id == told.campaign_id
     runs.end(number)
     assert len(runs.measured()) == done.measured + done.validated
+
+
+def test_a_request_to_stop_that_is_lost_is_sent_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = bench.start(FakeCell)
+    cell.answer = lambda q: "hang"
+    client = Client(context=bench.context)
+    bench.nodes.append(client)  # which nobody spins: as where a node ends
+    execution = PlanExecution(client, "tracker_simulator/execute_plan")
+    bench.wait(lambda: execution.ready)
+    robot = Robot.load("planar_2r")
+    plan = plan_to_message(plan_of(robot, random_configurations(robot, 1)), "p", 0, "")
+    execution.send(ExecutePlan.Goal(plan=plan))
+    bench.wait(lambda: cell.visited)
+    with monkeypatch.context() as lost:
+        lost.setattr(execution, "_cancel", lambda name: None)
+        execution.cancel()
+    execution.insist(60.0)
+    assert cell.cancels
+    bench.wait(lambda: cell.stopped == 1)
+    execution.insist(60.0)  # it was answered

@@ -63,6 +63,8 @@ PERIOD = 0.05
 """Time between two looks at what there is to do [s]."""
 PATIENCE = 4.0
 """Time that the search of a plan has to end when it is stopped [s]."""
+LONGEST_STOP = 2.0
+"""Time that the robot's node has to answer that it stops, when the campaign's node is stopped [s]."""
 
 STATES = {
     CampaignStatus.IDLE: "idle",
@@ -133,8 +135,8 @@ class CampaignNode(ManagedNode[CampaignParameters]):
 
     def deactivate(self) -> None:
         """Stop the robot and the search of a plan; measurements stay."""
-        self._measuring.leave()
         self._ending_plan.set()
+        self._measuring.end(LONGEST_STOP)
         self._thread.shutdown(wait=False, cancel_futures=True)
         if self._work is not None and self._work in wait([self._work], PATIENCE).done:
             self._work = None

@@ -22,11 +22,13 @@ what has queued up in the order of arrival, at a cost per message that is small 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -155,6 +157,20 @@ class _Unwoken(CallbackGroup):
         return self.can_execute(entity)
 
     def ending_execution(self, entity: object) -> None:
+        return
+
+
+def take_answers(client: Client) -> None:
+    """Hand out the answers that have come to a client, where no executor does."""
+    try:
+        with client.handle:
+            while True:
+                header, response = client.handle.take_response(client.srv_type.Response)
+                if header is None:
+                    return
+                with suppress(KeyError):  # nobody waits for it any more
+                    client.get_pending_request(header.request_id.sequence_number).set_result(response)
+    except InvalidHandle:  # the client was destroyed
         return
 
 
