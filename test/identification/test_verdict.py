@@ -523,7 +523,7 @@ def test_no_gain_left_out_is_no_failure_where_few_are_left_or_test_poses_gain() 
     ):
         base = sound("terms")
         residuals = replace(base.residuals, before=statistics(mean, 1.2e-3), spare=spare)
-        left, poses = left_out_of(1e-3, 1e-3), {"predicted": np.full(2, overall)}
+        left, poses = left_out_of(1e-3, 1e-3) | {"mean": 9e-4}, {"predicted": np.full(2, overall)}
         got = levels("terms", residuals=residuals, left_out=left, accuracy=poses)
         assert got.get("no_gain_left_out") == level
         assert ("too_few_measurements" in got) == (spare < 100.0)
