@@ -221,6 +221,24 @@ def test_the_f_ratio_is_that_of_nested_least_squares() -> None:
         assert answer.counted == pytest.approx(min(1.0, 7.0 * answer.probability))
 
 
+def test_columns_and_doubts_leave_alone_what_was_not_seen() -> None:
+    problem = plain()
+    blind = problem.seen == 0.0
+    columns = np.random.default_rng(0).standard_normal((*problem.y.shape, 2))
+    wide = _widened(problem, columns)
+    np.testing.assert_array_equal(wide.columns[..., :-2], problem.columns)
+    np.testing.assert_array_equal(wide.columns[~blind, -2:], columns[~blind])
+    assert blind.sum() == 6 and not wide.columns[blind, -2:].any()
+    assert wide.flat.tolist() == [*problem.flat, problem.columns.shape[2], problem.columns.shape[2] + 1]
+    doubt = np.random.default_rng(1).uniform(0.0, 1.0, (18, 2))
+    doubtful = _Fine._with(problem, doubt)
+    for n in range(18):
+        expected = problem.covariance[n] + np.diag(np.repeat(doubt[n], 3) * problem.seen[n])
+        np.testing.assert_allclose(doubtful.covariance[n], expected, rtol=1e-12)
+    for without in (_Fine._with(doubtful, 0.0 * doubt), _Fine._with(problem, 0.0 * doubt)):
+        np.testing.assert_array_equal(without.covariance, problem.covariance)
+
+
 def test_no_evidence_without_columns_of_its_own_or_with_few_coordinates_to_spare() -> None:
     problem = plain()
     solution = solve(problem)
