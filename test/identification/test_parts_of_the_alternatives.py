@@ -752,6 +752,45 @@ def test_what_is_left_is_the_median_distance_with_what_is_unknown_fitted() -> No
         assert rough.level > left.level and rough.spare == left.spare + 6
 
 
+@pytest.mark.parametrize("kind", ["", "scale", "ratio"])
+@pytest.mark.parametrize("unknowns", [(), ("base",), ("tool",), ("base", "tool")])
+def test_a_step_of_the_zeros_is_weighted_least_squares(unknowns: tuple[str, ...], kind: str) -> None:
+    """By differences of the points; zeros are known to 20 mrad in all, base and targets not at all."""
+    robot = arm(2, unknowns).with_base(rotation(2, 0.7) @ rotation(0, 0.1), [1.0, 2.0, -0.5])
+    rng = np.random.default_rng(4)
+    q = random_configurations(robot, 9, 3)
+    moved = q + 0.01 * rng.standard_normal(6)
+    points = robot.positions(moved)
+    apart, weights, level = 0.01 * rng.standard_normal(points.shape), rng.uniform(0.1, 1.0, (9, 2)), 0.3
+    one = gross(robot, q, points + apart)
+    change = one._change(kind, q, points + apart, scale=kind == "scale", ratio=2 if kind == "ratio" else None)
+    placed = (robot.base_pose[0], robot.target_offsets, points)
+    got = one._step(change, moved, q, placed, apart, (weights, level))
+
+    def there(x: FloatArray) -> FloatArray:
+        """Points after a change of zeros, amount, base (translation, rotation about its origin) and offsets."""
+        turned = moved + x[:6]
+        if kind == "ratio":
+            turned = column(turned, 2, turned[:, 2] + x[6] * q[:, 2])
+        result = robot.with_targets(robot.target_offsets + x[13:].reshape(2, 3)).positions(turned)
+        result = result * (1.0 + x[6]) if kind == "scale" else result
+        return result + x[7:10] + np.cross(x[10:13], result)
+
+    free = [*range(6), *([6] if kind else [])]
+    free += [*range(7, 13)] * ("base" in unknowns) + [*range(13, 19)] * ("tool" in unknowns)
+    steps = 1e-6 * np.eye(19)
+    columns = np.stack([(there(s) - there(-s)).ravel() / 2e-6 for s in steps[free]], axis=1)
+    root = np.sqrt(np.repeat(weights.ravel(), 3)) / level
+    prior = np.eye(len(free))[:6] / 0.02
+    off = -(moved - q)[0] / 0.02
+    if kind == "ratio":
+        off[2] = 0.0  # what it is off already is told by the ratio
+    rows, right = np.vstack([root[:, None] * columns, prior]), np.append(root * apart.ravel(), off)
+    expected = np.linalg.lstsq(rows, right, rcond=1e-9)[0]
+    np.testing.assert_allclose(got[:6], expected[:6], atol=1e-7)
+    assert got[6] == pytest.approx(expected[6] if kind else 0.0, abs=1e-7) and len(got) == 7
+
+
 @pytest.mark.parametrize("unknowns", [(), ("base",), ("tool",), ("base", "tool")])
 def test_places_are_fitted_as_far_as_they_are_unknown(unknowns: tuple[str, ...]) -> None:
     robot = arm(1, unknowns).with_base(rotation(2, -0.4), [0.3, 0.0, 0.8])
