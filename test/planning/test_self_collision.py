@@ -87,6 +87,27 @@ def test_neighbours_and_stretched_arm(arm):
     ]
 
 
+@pytest.mark.parametrize(
+    ("xyz", "expected"),
+    [
+        ("0 0 0", [True, True]),  # within the ball, which is a neighbour
+        # Its place in the tip's frame is that of the base for the second configuration.
+        (f"{-1 - np.cos(2.636)} {np.sin(2.636)} 0", [True, False]),
+        ("0.15 0 0", [False, False]),  # at the finger, which is no neighbour although both hang at the tip
+    ],
+)
+def test_a_wheel_that_the_robot_does_not_know_stands_at_zero(arm, tmp_path, xyz, expected):
+    robot, free = arm
+    path = tmp_path / "wheel.urdf"
+    ball = shape('<sphere radius="0.03"/>', xyz)
+    wheel = f'<link name="wheel">{ball}</link>'
+    turns = '<joint name="turn" type="continuous"><parent link="tip"/><child link="wheel"/></joint></robot>'
+    path.write_text(ARM.replace("</robot>", wheel + turns))
+    q = np.array([[0.3, 0.4], [0.0, 2.636]])
+    assert free.allowed(robot, q).all()
+    assert SelfCollision(path).allowed(robot, q).tolist() == expected
+
+
 def test_joints_in_another_order_are_matched_by_name(arm, tmp_path):
     robot, free = arm
     q = np.array([[0.4, np.pi], [np.pi - 0.2, 0.4]])
