@@ -26,12 +26,13 @@ from calib_planner.planning.bound import (
 from calib_planner.planning.certify import branch_and_bound
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
-from calib_planner.planning.certify.polynomial import polynomial, square_root
+from calib_planner.planning.certify.polynomial import polynomial, sensitivity, square_root
 from calib_planner.planning.certify.prove import _scale, prove_bound, prove_maximum
 from calib_planner.planning.criteria import Accuracy, Determinant, Eliminating, PowerMean
 from calib_planner.planning.information import PlanSpace
 from calib_planner.planning.search.descent import Descent
 from calib_planner.planning.search.multistart import SearchProblem, search_chunk
+from calib_planner.robot import Element
 from calib_planner.tracker import LaserTracker
 
 SLACK = 1e-9
@@ -211,6 +212,53 @@ def test_polynomial_is_the_sensitivity():
         assert got == pytest.approx(value, rel=1e-9)
 
 
+EPS = np.finfo(float).eps
+
+
+def test_the_allowance_is_for_every_operation_and_for_what_is_dropped():
+    """Its parts from below: an eps for each factor and term, by as much as coefficients of boxes enlarge it."""
+    for robot in (mixed(), Robot.load("kuka_kr270")):
+        space = plan_space(PlanProblem(robot, np.zeros(len(robot.joint_names)), 8))
+        root = np.random.default_rng(0).normal(size=(space.prior.shape[0], 3))
+        root *= 1.0 / np.linalg.norm(root)
+        q = random_configurations(robot, 10_000, 2)  # more than a block
+        d, error = sensitivity(space.single, root, q)
+        rows = space.single.whitened(q)
+        np.testing.assert_allclose(d, np.sum((rows @ root) ** 2, axis=(1, 2)), rtol=1e-12)
+        size = np.sqrt(np.sum(rows**2, axis=(1, 2)).max())
+        steps = len(robot.elements) + 2 * len(root)
+        assert 2 * np.sqrt(d.max()) * EPS * steps * size <= error <= 20 * np.sqrt(d.max()) * EPS * steps * size
+        found = polynomial(space.single, root)
+        axes = [
+            Axis.of(*row, bool(t)) for row, t in zip(robot.joint_limits, robot.joint_is_revolute, strict=True)
+        ]
+        nodes = np.stack(np.meshgrid(*[a.nodes for a in axes], indexing="ij"), axis=-1).reshape(-1, len(axes))
+        values, at_nodes = sensitivity(space.single, root, nodes)
+        terms = np.abs(found.tensor).sum()
+        # Harmonics are sums of five along every axis; halving takes means of five, forty times for every axis.
+        at_nodes += 5 * EPS * len(axes) * values.max()
+        least = amplification(found.axes) * at_nodes + 5 * 40 * len(found.axes) * EPS * terms
+        assert least <= found.allowance <= 1e-7 * d.max()
+
+
+def test_a_joint_that_hardly_matters_is_dropped_and_allowed_for():
+    """A third link of 2e-11 m: its joint does less than 1e-10 of the sensitivity, and more than rounding."""
+    links = [
+        e
+        for k, x in enumerate((1.0, 0.8, 2e-11))
+        for e in (Element("Rz", 0.0, k, 1.0, f"q{k}"), Element("Tx", x))
+    ]
+    robot = Robot("arm", tuple(links), (), ("a", "b", "c"), np.array([[-3.0, 3.0]] * 3))
+    robot = robot.with_targets([[0.0, 0.0, 0.0]]).with_parameters("q0,q1")
+    space = plan_space(PlanProblem(robot, [0.1, 0.2, 0.3], 4, noise=1.0))
+    root = np.array([[1.0], [2.0]])
+    found = polynomial(space.single, root)
+    assert found.active == (1,)
+    q = random_configurations(robot, 500, 4)
+    away = np.abs(sensitivity(space.single, root, q)[0] - values_of(found.axes, found.tensor, q[:, [1]]))
+    assert 1e-11 < away.max() <= found.allowance < 1e-8
+
+
 @pytest.mark.parametrize("turns", [True, False])
 @pytest.mark.parametrize("half", [0.01, 0.4, np.pi / 3, 1.5])
 def test_bernstein_basis_is_a_weighting_and_halves_agree(turns, half):
@@ -315,7 +363,7 @@ def test_the_maximum_of_a_polynomial_is_enclosed(shape, seed, monkeypatch):
     assert known.largest == top or known.largest == pytest.approx(top, rel=1e-9)
     assert known.boxes <= maximise(axes, tensor, 0.0, tolerance=1e-2).boxes
     with monkeypatch.context() as patched:
-        patched.setattr(branch_and_bound, "CHUNK", tensor.size)
+        patched.setattr(branch_and_bound, "CHUNK", 1)
         singly = maximise(axes, tensor, 0.0, tolerance=1e-6)
         assert singly.upper >= top * (1 - 1e-13) and singly.upper <= singly.largest * (1 + 1e-6) * (1 + 1e-13)
         patched.setattr(branch_and_bound, "MEMORY", 3 * tensor.size)

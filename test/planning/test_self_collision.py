@@ -108,6 +108,41 @@ def test_a_wheel_that_the_robot_does_not_know_stands_at_zero(arm, tmp_path, xyz,
     assert SelfCollision(path).allowed(robot, q).tolist() == expected
 
 
+def test_a_wheel_on_the_base_is_in_the_way_of_the_arm(arm, tmp_path):
+    """Whatever number its joint has: a name before all others makes it Pinocchio's first."""
+    robot, free = arm
+    ball = shape('<sphere radius="0.03"/>', "0 0.9 0")
+    turns = '<joint name="a" type="continuous"><parent link="base"/><child link="a"/></joint></robot>'
+    path = tmp_path / "wheel.urdf"
+    path.write_text(ARM.replace("</robot>", f'<link name="a">{ball}</link>{turns}'))
+    # The upper arm moves about the same axis and is no neighbour: both hang at the base, which is one.
+    q = np.array([[0.0, 0.0], [np.pi / 2, 0.0], [0.0, 2.0]])
+    assert free.allowed(robot, q).all()
+    assert SelfCollision(path).allowed(robot, q).tolist() == [True, False, True]
+
+
+def test_meshes_are_beside_the_file_or_in_a_folder_that_is_named(arm, tmp_path):
+    robot, _ = arm
+    corners = 0.15 * np.array([[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
+    faces = [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
+    text = "".join(
+        "facet normal 0 0 0 outer loop "
+        + " ".join(f"vertex {x} {y} {z}" for x, y, z in corners[face])
+        + " endloop endfacet\n"
+        for face in faces
+    )
+    for place in (tmp_path / "beside", tmp_path / "away"):
+        (place / "arm").mkdir(parents=True)
+        (place / "arm" / "base.stl").write_text(f"solid base\n{text}endsolid base\n")
+    mesh = ARM.replace('<box size="0.2 0.2 0.2"/>', '<mesh filename="package://arm/base.stl"/>')
+    q = np.array([[0.0, 0.0], [0.0, np.pi]])
+    for folder, package in (("beside", None), ("elsewhere", tmp_path / "away")):
+        path = tmp_path / folder / "arm.urdf"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(mesh)
+        assert SelfCollision(path, package).allowed(robot, q).tolist() == [True, False]
+
+
 def test_joints_in_another_order_are_matched_by_name(arm, tmp_path):
     robot, free = arm
     q = np.array([[0.4, np.pi], [np.pi - 0.2, 0.4]])
