@@ -126,12 +126,14 @@ def test_line_of_sight():
 
 def test_joint_range():
     part = JointRange({"q2": [0.5, 1.0]})
-    assert allowed(part, [3, 0.5], [0, 0.4], [0, 1.1]) == [True, False, False]
+    assert allowed(part, [3, 0.5], [0, 1.0], [0, 0.4], [0, 1.1]) == [True, True, False, False]
     np.testing.assert_array_equal(part.limits(planar())[1], [0.5, 1.0])
     with pytest.raises(UnknownNameError, match="q1, q2"):
         JointRange({"q3": [0, 1]}).limits(planar())
     with pytest.raises(InfeasibleError, match="degrees"):
         JointRange({"q2": [10, 90]}).limits(planar())
+    with pytest.raises(InfeasibleError, match="outside"):  # a single place is no range
+        JointRange({"q2": [planar().joint_limits[1, 1], 90]}).limits(planar())
     with pytest.raises(InfeasibleError, match=r"joint range and joint range.*q2"):
         Feasibility(planar(), (part, JointRange({"q2": [1.5, 2]}))).limits
 
