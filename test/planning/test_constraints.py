@@ -78,6 +78,9 @@ def test_a_sliding_first_joint_counts_for_the_height():
     q = random_configurations(robot, 200)
     heights = robot.posture(q).joint_origins[:, 0, 2]
     assert not MinimumHeight(float(np.median(heights))).allowed(robot, q)[heights < np.median(heights)].any()
+    # A ball of the radius of what moves with it, in front of a column that does not.
+    margins = MinimumHeight(0.0, capsules=Capsules([0.9, 0.2, 0.0, 0.0, 0.0])).margins(robot, robot.posture(q))
+    np.testing.assert_allclose(margins[:, 0], heights - 0.2, atol=1e-15)
 
 
 def test_tracker_range_and_elevation():
