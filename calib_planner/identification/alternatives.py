@@ -569,14 +569,7 @@ class _Fine:
                 for answer in self._answers(self._solved(problem, doubt)):
                     answer = replace(answer, count=answer.count * len(doubts) * len(problems))
                     q = answer.question
-                    key = (
-                        q.code,
-                        q.target,
-                        q.joint,
-                        q.beside,
-                        q.code == "prior" and len(q.rows),
-                        q.columns.shape[2],
-                    )
+                    key = (q.code, q.target, q.joint, q.beside, q.columns.shape[2])
                     if answer.counted < SUSPICIOUS and (
                         key not in chosen or _order(answer) < _order(chosen[key][0])
                     ):

@@ -281,6 +281,28 @@ def test_the_visit_at_which_it_began_is_that_of_the_largest_statistic() -> None:
         assert (row, rank) == (cuts[best], ranks[best]) and value == pytest.approx(values[best], rel=1e-6)
 
 
+def test_of_many_visits_some_are_tried_first_and_then_those_about_the_best(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slipped, fit = slipping()
+
+    def told() -> dict[tuple[Any, ...], tuple[int | None, float]]:
+        answers = fine(slipped, fit)._answers(fit.solution)
+        return {
+            (a.question.code, a.question.target, a.question.joint, a.question.beside): (
+                a.question.row,
+                a.statistic,
+            )
+            for a in answers
+        }
+
+    every = told()
+    monkeypatch.setattr(alternatives, "MOST_CUTS", 7)
+    some = told()
+    for key in (("joint_step", None, 3, None), ("push", None, None, None)):
+        assert some[key] == (every[key][0], pytest.approx(every[key][1])) and some[key][0] not in (None, 3)
+
+
 def test_scales_that_have_swollen_are_tried_at_their_usual_upper_end() -> None:
     model = typical()
     usual = {s.name: s.median * np.sqrt(s.factor) for s in model.scales}
@@ -890,11 +912,13 @@ def test_rows_that_slipped_beside_sound_ones_in_numbers() -> None:
     assert told.moved == pytest.approx(far, rel=0.01) and told.size == told.freedom == 10
     assert told.statistic == told.deviations == pytest.approx(far / 1.6e-4, rel=0.3)
     assert told.gain == pytest.approx(-np.log(told.probability)) and not told.material
-    # Less than a tenth of the rows: a robust fit copes with them by itself. And so few as two are no run.
-    few = np.array(noisy)
-    few[10:13] = noisy[11:14]
-    assert explain_gross(robot, Measurements(robot.joint_names, q, few)) is None
     assert explain_gross(robot, Measurements(robot.joint_names, q, noisy)) is None
+    # With less than a tenth of the rows a robust fit copes by itself; and as few as two are no run.
+    for count, order, named in ((40, [11, 12, 10], False), (20, [11, 12, 10], True), (15, [11, 10, 12], False)):
+        few = np.array(noisy)
+        few[[10, 11, 12]] = noisy[order]
+        told = explain_gross(robot, Measurements(robot.joint_names, q[:count], few[:count]))
+        assert (told is not None) == named
 
 
 def test_too_few_visits_or_coordinates_to_spare_explain_nothing() -> None:
