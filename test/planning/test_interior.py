@@ -20,7 +20,7 @@ from calib_planner.planning import (
 )
 from calib_planner.planning.constraints import Custom
 from calib_planner.planning.feasibility import PlanWalls
-from calib_planner.planning.search.interior import descend_inside
+from calib_planner.planning.search.interior import HALVINGS, _direction, descend_inside
 
 STATION = np.array([4.0, 1.5, 1.2])
 WIDE = np.full(4, 9.0)
@@ -90,6 +90,127 @@ def test_joint_limits_and_a_mere_no_hold_beside_the_margins():
     assert x[0] <= 0.4 and x[3] <= 0.5
     np.testing.assert_allclose(x[2:], [0.0, 0.5], atol=1e-3)
     assert x[0] > 0.3  # rejected steps are shortened, not given up
+
+
+class Planes:
+    """Two points of the plane a row, each below ``edges`` (2,): walls that are their own tangents."""
+
+    def __init__(self, edges):
+        self.edges, self.steps = np.array(edges), 0
+
+    def margins(self, x):
+        return self.edges - x.reshape(len(x), 2, 2)
+
+    def normals(self, x):
+        return np.tile(-np.eye(2), (len(x), 2, 1, 1))
+
+    def step(self, old, new, margins, normals):
+        self.steps += 1
+        left = self.margins(new)
+        assert (left >= 0.05 * margins - 1e-12).all()  # no step goes more than 0.95 of the way to an edge
+        return new, left
+
+
+class NoWalls(Planes):
+    def margins(self, x):
+        return np.zeros((len(x), 2, 0))
+
+    def normals(self, x):
+        return np.zeros((len(x), 2, 0, 2))
+
+
+def counted(objective, walls, start, **settings):
+    """``descend_inside`` within ±9, and the number of its iterations."""
+    calls = []
+    ended = descend_inside(objective, walls, start, -WIDE, WIDE, cancel=lambda: bool(calls.append(0)), **settings)
+    return ended, len(calls)
+
+
+@pytest.mark.parametrize(("pressure", "most"), [(1.0, 9), (1e-2, 14), (1e-5, 16)])
+def test_steps_are_newtons_on_the_barrier(pressure, most):
+    """½(x − c)² − µ log(b − x) is least where (x − c)(b − x) + µ = 0. With B exact from the first step, the steps
+    are those of the primal-dual method, which double the digits at every step near its end."""
+    rng = np.random.default_rng(0)
+    edges, centre = np.array([0.7, 1.5]), np.array([3.0, -0.5, 0.8, 2.0])
+    b = np.tile(edges, 2)
+    wanted = 0.5 * (b + centre - np.sqrt((b - centre) ** 2 + 4.0 * pressure))
+    start = rng.uniform(-1.5, 0.6, (5, 4))
+    settings = {"pressures": (pressure, pressure), "tolerance": 1e-14}
+    ended, count = counted(squares(centre, np.ones(4)), Planes(edges), start, **settings)
+    np.testing.assert_allclose(ended.x, np.tile(wanted, (5, 1)), rtol=1e-7)
+    np.testing.assert_allclose(ended.value, 0.5 * np.sum((wanted - centre) ** 2), rtol=1e-6)
+    assert count <= most
+
+
+def test_a_direction_solves_the_newton_equations():
+    """(1) with B = H⁻¹, assembled whole; coordinates on a bound and pushed against it stay, as if they were none."""
+    rng = np.random.default_rng(3)
+    rows, size, joints, walls = 3, 2, 3, 4
+    half, total = rng.normal(size=(rows, 6, 6)), rng.normal(size=(rows, 6))
+    inverse = half @ np.swapaxes(half, 1, 2) + np.eye(6)
+    weights, normals = rng.uniform(0.1, 3.0, (rows, size, walls)), rng.normal(size=(rows, size, walls, joints))
+    low, high, x = -np.ones(6), np.ones(6), np.zeros((rows, 6))
+    x[1, 4] = np.sign(-total[1, 4])
+    got = _direction(x, total, inverse, weights, normals, low, high)
+    for row in range(rows):
+        free = [i for i in range(6) if (row, i) != (1, 4)]
+        matrix = np.linalg.inv(inverse[row][np.ix_(free, free)])
+        for c in range(size):
+            for k in range(walls):
+                a = np.zeros(6)
+                a[c * joints : (c + 1) * joints] = normals[row, c, k]
+                matrix += weights[row, c, k] * np.outer(a[free], a[free])
+        expected = np.zeros(6)
+        expected[free] = -np.linalg.solve(matrix, total[row, free])
+        np.testing.assert_allclose(got[row], expected, rtol=1e-8, atol=1e-12)
+    uphill = _direction(x, total, -np.tile(np.eye(6), (rows, 1, 1)), 0.0 * weights, normals, low, high)
+    np.testing.assert_allclose(uphill, -np.where(x != 0.0, 0.0, total))  # then it goes down steepest
+
+
+def test_a_first_step_has_its_length_and_gains_a_share_of_what_the_slope_promises():
+    """f = −x has fallen by 0.2 behind a step of 0.2, by less than 10⁻⁴ of that if f soon rises again: then a
+    quarter of the step is taken."""
+
+    def straight(x):
+        return -x[:, 0], np.tile([-1.0, 0.0, 0.0, 0.0], (len(x), 1))
+
+    def wavy(x):
+        return np.where(x[:, 0] > 0.1, -1e-5, -x[:, 0]), straight(x)[1]
+
+    ended, _ = counted(straight, NoWalls([0, 0]), np.zeros((1, 4)), iterations=1)
+    np.testing.assert_allclose(ended.x, [[0.2, 0.0, 0.0, 0.0]])
+    ended, _ = counted(straight, NoWalls([0, 0]), np.zeros((1, 4)), iterations=1, first_step=1.5)
+    np.testing.assert_allclose(ended.x, [[1.0, 0.0, 0.0, 0.0]])  # no longer than the gradient
+    ended, count = counted(wavy, NoWalls([0, 0]), np.zeros((1, 4)), iterations=1)
+    np.testing.assert_allclose(ended.x, [[0.05, 0.0, 0.0, 0.0]])
+    assert (count, ended.evaluations) == (1, 3)
+    assert counted(wavy, NoWalls([0, 0]), np.zeros((1, 4)), iterations=3, tolerance=0.0)[1] == 3
+
+
+def test_a_row_ends_when_it_gains_nothing_twice_or_fails_twice():
+    """At the last pressure; where nothing is finite but the start, and one step, a fresh search follows the
+    failed one."""
+    bowl, start = squares(np.zeros(4), np.ones(4)), np.full((1, 4), 0.5)
+    same = {"pressures": (1e-3, 1e-3)}
+    assert counted(bowl, NoWalls([0, 0]), start, tolerance=np.inf, **same)[1] == 2
+    valley = squares(np.zeros(4), np.array([1.0, 30.0, 2.0, 9.0]))
+    falling = {"pressures": (1e-3, 1e-4)}
+    assert counted(valley, NoWalls([0, 0]), start, tolerance=np.inf, **falling)[1] == 3 + 2  # 0.4³ < 0.1
+    with np.errstate(all="raise"):  # a start at the minimum has no direction
+        still, count = counted(bowl, NoWalls([0, 0]), np.zeros((1, 4)), **same)
+    assert count == 1 and not still.x.any()
+    for good, iterations in ((1, 1), (2, 3)):
+        calls = []
+
+        def failing(x, calls=calls, good=good):
+            calls.append(0)
+            value, gradient = bowl(x)
+            return np.where(len(calls) <= good, value, np.inf), gradient
+
+        ended, count = counted(failing, NoWalls([0, 0]), start, **same)
+        assert count == iterations and ended.evaluations == len(calls) == good + HALVINGS * (
+            (iterations + 1) // 2
+        )
 
 
 # ── the walls of a robot ─────────────────────────────────────────────────────────────────────────────────
