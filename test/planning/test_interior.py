@@ -143,7 +143,7 @@ def test_steps_are_newtons_on_the_barrier(pressure, most):
 
 
 def test_a_direction_solves_the_newton_equations():
-    """(1) with B = H⁻¹, assembled whole; coordinates on a bound and pushed against it stay, as if they were none."""
+    """(1) with B = H⁻¹, assembled whole; coordinates on a bound that are pushed against it stay."""
     rng = np.random.default_rng(3)
     rows, size, joints, walls = 3, 2, 3, 4
     half, total = rng.normal(size=(rows, 6, 6)), rng.normal(size=(rows, 6))

@@ -182,7 +182,7 @@ def test_every_choice_comes_once(together: Any, monkeypatch: pytest.MonkeyPatch)
 def test_a_plan_is_drawn_from_the_design_and_completed_by_others() -> None:
     rng = np.random.default_rng(0)
     support, others = rng.normal(size=(5, 2)), rng.normal(size=(4, 2))
-    weights = np.array([0.5, 1e-12, 0.2, 1e-12, 0.3])
+    weights = 7.0 * np.array([0.5, 1e-12, 0.2, 1e-12, 0.3])
     for count in (3, 5, 7):
         drawn, rest = drawn_plan(count, support, weights, others, rng)
         assert drawn.shape == (count, 2) and rest.shape == (9 - count, 2)

@@ -57,7 +57,7 @@ def rounded_rows(problem: ChoiceProblem, places: IntArray, rng: np.random.Genera
     if shared:
         return plans
     for count in range(min(len(places), 12), 0, -1):
-        few = replace(sharp, rows=problem.rows[places[:count]], weights=np.empty(0))
+        few = replace(sharp, rows=problem.rows[places[:count]])
         if seconds(few) <= QUICK:
             best = best_of_all(few, problem.criterion, lambda matrix: 0.0)
             return plans if best is None else [*plans, places[best.top_rows]]
