@@ -110,9 +110,11 @@ class Nodes:
 
     def __init__(self, folder: Path, domain: int, popen: Callable[..., Any] = subprocess.Popen) -> None:
         self._folder, self._children, self._popen = folder, list[_Child](), popen
-        self._environment = os.environ | {
+        # Whoever has a profile of Fast DDS has said there who is to be discovered.
+        chosen = "FASTRTPS_DEFAULT_PROFILES_FILE" in os.environ
+        self._environment = os.environ | ({} if chosen else {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+        self._environment |= {
             "ROS_DOMAIN_ID": str(domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }

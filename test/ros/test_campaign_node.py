@@ -122,7 +122,7 @@ def simulator_process(warm: Warm, folder: Path, domain: int) -> Forked:
     command = [sys.executable, "-m", "calib_planner.ros.nodes.simulator", "--ros-args"]
     for name, value in SIMULATOR.items():
         command += ["-p", f"{name}:={value}"]
-    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
     with (folder / "simulator.log").open("ab") as log:
         return warm.popen(command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
 

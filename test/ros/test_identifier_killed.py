@@ -35,11 +35,6 @@ ROBOT = Robot.load("planar_2r").with_parameters("lengths+offsets")
 TRUE = ROBOT.with_deviations(random_deviations(ROBOT, 6))
 PLAN = plan_of(ROBOT, random_configurations(ROBOT, 8, 5))
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
-NO_SHARED_MEMORY = {
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[2] / "bench" / "loopback.xml"),
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",  # else rmw_fastrtps adds shared memory to the profile
-}
-"""Of a node that is killed: what it leaves half made there would have every later one wait for ever."""
 AVERAGED = 40
 """Points that the identifier averages, 0.4 s of 100 Hz: its mean has the noise that it is taken for."""
 
@@ -109,7 +104,7 @@ def started(warm: Warm, folder: Path, log: Path, domain: int) -> Forked:
     for topic in ("joint_states", "tracker/point"):
         command += ["-p", f"qos_overrides./{topic}.subscription.reliability:=reliable"]
     command += ["-p", "robot:=planar_2r", "-p", f"store_folder:={folder}"]
-    environment = os.environ | NO_SHARED_MEMORY | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
     with log.open("ab") as sink:
         return warm.popen(command, stdout=sink, stderr=sink, env=environment)
 

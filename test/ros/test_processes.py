@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,8 @@ with own_domain() as domain:
 """
 
 
+PARAMETERS = {"page_node": {"port": 0}}
+"""A free port: another test may have a page at the default one."""
 NOT_OF_THE_DEMO = ("campaign_node", "executor_node", "page_node")
 """Started here in processes of their own, by an interpreter that has imported nothing; the others by the demo."""
 
@@ -84,7 +87,7 @@ def test_nodes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 def test_every_node_ends_with_status_0(warm: Warm, tmp_path: Path, number: signal.Signals) -> None:
     with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         for name in node_names():
-            nodes.start(name)
+            nodes.start(name, PARAMETERS.get(name))
         logs = [tmp_path / f"{name}.log" for name in node_names()]
         assert wait(lambda: all(log.stat().st_size for log in logs))
         nodes.check()
@@ -129,7 +132,7 @@ def test_ctrl_c_several_times_ends_all_nodes_with_status_0(warm: Warm, tmp_path:
     names = node_names()
     with own_domain() as domain, Nodes(tmp_path, domain, warm.popen) as nodes:
         for name in names:
-            nodes.start(name)
+            nodes.start(name, PARAMETERS.get(name))
         logs = {name: tmp_path / f"{name}.log" for name in names}
         assert wait(lambda: all(log.stat().st_size for log in logs.values()))
         nodes.check()
@@ -139,7 +142,7 @@ def test_ctrl_c_several_times_ends_all_nodes_with_status_0(warm: Warm, tmp_path:
             os.kill(nodes.processes[name], signal.SIGINT)
         for instant, name in sorted(again):
             time.sleep(max(0.0, began + instant - time.monotonic()))  # the instants are what is tried
-            if running(nodes.processes[name]):
+            with suppress(ProcessLookupError):  # it has ended
                 os.kill(nodes.processes[name], signal.SIGINT)
         assert nodes.end(signal.SIGINT) == dict.fromkeys(names, 0), nodes.logs()
     for log in logs.values():
