@@ -94,7 +94,8 @@ class Forked:
     def send_signal(self, number: int) -> None:
         """Nothing, if it has ended."""
         if self.poll() is None:
-            os.kill(self.pid, number)
+            with suppress(ProcessLookupError):  # its end is being told
+                os.kill(self.pid, number)
 
     def kill(self) -> None:
         """End it at once."""
