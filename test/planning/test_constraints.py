@@ -120,6 +120,8 @@ def test_line_of_sight():
     """The base column stands between the tracker and an arm that points away from it."""
     station = [4.0, 0.0, 0.0]
     assert allowed(LineOfSight(station, Capsules(0.1)), RIGHT, LEFT, UP) == [True, False, True]
+    many = planar().with_targets(np.zeros((5, 3)))  # more targets than links
+    assert allowed(LineOfSight(station, Capsules(0.1)), RIGHT, LEFT, robot=many) == [True, False]
     # Folded back, the tip hangs 0.2 m beside the base: the first link is in the way of a station behind it.
     folded = [0.0, np.pi]
     assert allowed(LineOfSight([-4.0, 0, 0], Capsules(0.1)), folded) == [False]
@@ -144,9 +146,9 @@ def test_joint_range():
 # ── against plain loops, on robots in space ──────────────────────────────────────────────────────────
 
 
-def plain(robot, q):
+def plain(robot, q, capsules=None):
     """Per configuration: by how much it keeps the constraints below, one target and link at a time."""
-    radii = Capsules().of(robot)
+    radii = (capsules or Capsules()).of(robot)
     near = radii[:-1].max()
     for row in q:
         posture = robot.posture(row)
@@ -173,9 +175,10 @@ def test_against_plain_loops(case):
     robot = CASES[case]()
     q = random_configurations(robot, 60, 5)
     posture = robot.posture(q)
-    seen, facing, clear = (np.array(column) for column in zip(*plain(robot, q), strict=True))
+    capsules = Capsules(0.15 - 0.02 * np.arange(len(robot.joint_names) + 1))
+    seen, facing, clear = (np.array(column) for column in zip(*plain(robot, q, capsules), strict=True))
     range_, elevation = TrackerRange(STATION, 2.0, 4.5), TrackerElevation(STATION, low=-0.1, high=0.4)
-    cone, sight = ReflectorAcceptance(STATION, [1, 0, 0], 1.0), LineOfSight(STATION)
+    cone, sight = ReflectorAcceptance(STATION, [1, 0, 0], 1.0), LineOfSight(STATION, capsules)
     both = np.concatenate([part.margins(robot, posture) for part in (range_, elevation)], axis=1)
     np.testing.assert_allclose(np.sort(both), np.sort(seen), atol=1e-12)
     np.testing.assert_array_equal(range_.allowed(robot, q) & elevation.allowed(robot, q), (seen >= 0).all(axis=1))
