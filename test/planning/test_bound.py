@@ -27,7 +27,7 @@ from calib_planner.planning.certify import branch_and_bound
 from calib_planner.planning.certify.bernstein import Axis, amplification, basis, first_boxes, halves
 from calib_planner.planning.certify.branch_and_bound import maximise
 from calib_planner.planning.certify.polynomial import polynomial, sensitivity, square_root
-from calib_planner.planning.certify.prove import _scale, prove_bound, prove_maximum
+from calib_planner.planning.certify.prove import Proof, _scale, prove_bound, prove_maximum
 from calib_planner.planning.criteria import Accuracy, Determinant, Eliminating, PowerMean
 from calib_planner.planning.information import PlanSpace
 from calib_planner.planning.search.descent import Descent
@@ -424,6 +424,55 @@ def test_any_positive_slope_gives_a_bound(seed):
         matrix = positive()
         own = square_root(criterion.supporting_gradient(matrix))
         assert _scale(criterion, own) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_closed_forms_are_rounded_to_the_safe_side():
+    """By hand, with numbers that binary digits hold: c no larger than exact, the ceiling no smaller."""
+    root = np.diag([2.0, 2.0, 0.5, 0.5])
+    exact = [
+        (Determinant(), 4.0),  # det G = 2⁴ · 0.5⁴ = 1
+        (PowerMean(8.0, smallest=True), 8.5),
+        (Accuracy(np.diag([1.0, 4.0, 16.0, 64.0])), (2.0 + 4.0 + 2.0 + 4.0) ** 2),
+    ]
+    for criterion, value in exact:
+        assert value * (1 - 1e-11) < _scale(criterion, root) < value
+    proof = Proof(0.25, 0.25, np.zeros(4), root @ root.T, 8.0, 1, (), 0.0, "proven")
+    prior = np.diag([1.0, 2.0, 4.0, 8.0])  # tr G M₀ = 15
+    for visits in (0, 4):
+        value = (15.0 + 0.25 * visits) / 8.0
+        assert value <= proof.ceiling(prior, visits) < value * (1 + 1e-11)
+        assert proof.ceiling(np.zeros((4, 4)), visits) == 0.25 * visits / 8.0
+    assert proof.tolerance == 0.0 and dataclasses.replace(proof, maximum_upper=0.275).tolerance == pytest.approx(
+        0.1
+    )
+    assert dataclasses.replace(proof, largest_seen=0.0).tolerance == np.inf
+
+
+def test_work_time_and_cancellation_end_a_proof_that_holds():
+    problem = PlanProblem(Robot.load("kuka_kr270"), TEST_POSE, 4)
+    space = plan_space(problem)
+    asked, rng = design_problem(space), np.random.default_rng(0)
+    design = approximate_design(asked, problem.test_pose_array, rng, rounds=2)
+    whole = prove_maximum(space.model, asked.criterion, design.gradient, design.support, tolerance=1e-7)
+    assert whole.status == "proven" and whole.holds and whole.work % whole.boxes == 0
+    for status, settings in [
+        ("time_limit", {"time_limit": 0.0}),
+        ("time_limit", {"cancel": lambda: True}),
+        ("work", {"most_work": 1.0}),
+    ]:
+        early = prove_maximum(
+            space.model, asked.criterion, design.gradient, design.support, tolerance=1e-7, **settings
+        )
+        assert early.status == status
+        assert early.maximum_upper >= whole.largest_seen and early.boxes < whole.boxes
+        assert early.largest_seen <= whole.maximum_upper
+    timed, late = prove_bound(asked, design, rng, tolerance=1e-12, time_limit=0.0)
+    assert late.status == "time_limit" and timed.bound >= whole.ceiling(space.prior, 4) * (1 - 1e-6)
+    # Work that suffices by one coefficient, and that does not.
+    just = prove_maximum(
+        space.model, asked.criterion, design.gradient, design.support, tolerance=1e-7, most_work=whole.work
+    )
+    assert (just.status, just.work, just.maximum_upper) == ("proven", whole.work, whole.maximum_upper)
 
 
 # ── what the planner makes of it ─────────────────────────────────────────────────────────────────────

@@ -189,3 +189,21 @@ def test_a_pose_by_hand() -> None:
     turn, xyz = pose_of((Element("Tx", 1.0), Element("Rz", np.pi / 2, sign=-1.0), Element("Ty", 2.0, sign=-1.0)))
     np.testing.assert_allclose(xyz, [-1.0, 0.0, 0.0], atol=1e-15)  # y looks along +x after the quarter turn
     np.testing.assert_allclose(turn, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["Rx", "Tz"])
+def test_a_chain_that_names_its_parameters_as_a_urdf_does_is_none(kind: str) -> None:
+    """Nine elements before the joint, the first of them called j.x, that are no pose of a URDF."""
+    before = (Element(kind, 0.1, parameter="j.x"), *(Element(kind, 0.01 * k) for k in range(8)))
+    links = (*before, Element("Rz", joint=0), Element("Tx", 0.5))
+    robot = based(Robot("r", links, (), ("j",), np.array([[-1.0, 1.0]])).with_targets([[0.0, 0.0, 0.0]]))
+    origins = joint_origins(robot)
+    assert origins.tip is not None and origins.tip.xyz.tolist() == [0.5, 0.0, 0.0]
+    tip = tip_of(robot, origins, np.array([0.3]), {})
+    np.testing.assert_allclose(tip[:3, 3], robot.posture([0.3]).tip_origin[0], atol=1e-15)
+
+
+def test_no_number_is_minus_zero() -> None:
+    origin = Origin(np.array([-0.0, 1.0, -2.0]), np.array([0.0, -0.0, 0.5]))
+    assert np.signbit(origin.xyz).tolist() == [False, False, True] and not np.signbit(origin.rpy).any()
+    assert not any(np.signbit(axis[axis == 0.0]).any() for axis in joint_origins(mixed()).axes.values())
