@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -185,6 +186,26 @@ def test_without_test_poses_predictions_are_compared_at_some_measured_configurat
 
 
 # ── evidence ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 5), (12, 18), (7, 12)])
+def test_a_run_that_is_shifted_is_a_push_at_one_of_its_ends_or_a_block(first: int, last: int) -> None:
+    """A push that turned nothing, before the visit that follows the run or before its first."""
+    inside = (np.arange(18) >= first) & (np.arange(18) < last)
+    data = changed(measured(), measured().p + 3e-3 * inside[:, None, None])
+    one, solution = fine(data), solve(_Work(unknown(ur10e()), data, SMALL).linearised())
+    (question,) = one._runs(solution)
+    columns = np.tile(np.eye(3), (18, 2, 1))
+    there = np.zeros((5, 2, 3, 3)) if question.code == "block" else np.tile(np.eye(3), (5, 2, 1, 1))
+    if question.code == "block":
+        assert (first, last) == (7, 12) and question.rows == tuple(range(7, 12)) and question.row == 7
+        columns = columns * inside[:, None, None]
+    else:
+        assert question.code == "push" and question.rows == () and question.row == (last if first == 0 else first)
+        columns = columns * (np.arange(18) >= question.row)[:, None, None]
+    np.testing.assert_array_equal(question.columns, columns)
+    np.testing.assert_array_equal(question.there, there)
+    assert not question.cut and list(one._runs(fitted().solution)) == []
 
 
 @cache
@@ -685,6 +706,18 @@ def test_among_the_changes_is_the_one_that_undoes_a_mistake(mistake: str) -> Non
         assert f"elbow_joint {mistake.split()[1]} shoulder_lift_joint" in told.text
     if code == "targets":
         assert "1, 2, 3 are exchanged in every row" in told.text
+
+
+@pytest.mark.parametrize("targets", [1, 2, 3, 4, 5])
+def test_every_order_of_up_to_four_targets_is_tried(targets: int) -> None:
+    robot = ur10e(1).with_targets(0.1 * scattered(1, targets)[0]).with_parameters("full", ("base",))
+    q = random_configurations(robot, 6, 1)
+    one = gross(robot, q, robot.positions(q))
+    changes = [c for c in one._changes(one._change("", one.q, one.p)) if c.code == "targets"]
+    orders = list(permutations(range(targets)))[1:] if targets < 5 else []
+    assert len(changes) == len(orders)
+    for order, change in zip(orders, changes, strict=True):
+        np.testing.assert_array_equal(change.p, one.p[:, order])
 
 
 @pytest.mark.parametrize("shift", [1, -1, 2, -2])
