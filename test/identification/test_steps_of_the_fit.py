@@ -104,6 +104,8 @@ def test_a_step_is_as_long_as_the_robots_bend_allows(size: float, model: ErrorMo
         np.testing.assert_allclose(step, share * full, rtol=1e-9, atol=1e-15)
         shares.append(round(share, 6))
         before = cost(work, solution, old)
+        for beta in (old, old + full):
+            assert work._cost(solution.problem, beta) == pytest.approx(cost(work, solution, beta), rel=1e-9)
         moved = np.abs(solution.problem.columns @ full).max()
         if moved > 1e-4:
             tried = [1.0, 0.5, 0.25, 0.1, 0.03]
