@@ -23,6 +23,7 @@ from calib_planner.planning.search.enumeration import seconds
 from calib_planner.planning.search.exchange import ChoiceProblem
 from calib_planner.planning.search.multistart import (
     DRAWN,
+    EDGE_ROUNDS,
     LIGHT,
     SearchProblem,
     _starts,
@@ -195,22 +196,24 @@ def test_the_objective_is_minus_log_psi_and_has_its_gradient(whole: bool) -> Non
 
 
 class Never(Determinant):
-    """A criterion by which the second plan is worth less than nothing, as rounding has it of singular ones."""
+    """A criterion by which the second plan is worth less than nothing, as rounding has it of singular ones, and
+    the third just nothing."""
 
     def value_and_gradient(self, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         psi, gradient = super().value_and_gradient(matrices)
-        none = np.arange(len(matrices)) == 1
-        return np.where(none, -1e-9, psi), np.where(none[:, None, None], 0.0, gradient)
+        none = np.isin(np.arange(len(matrices)), [1, 2])
+        psi = np.where(none, [0.0, -1e-9, 0.0, 0.0], psi)
+        return psi, np.where(none[:, None, None], 0.0, gradient)
 
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_plan_that_is_worth_nothing_is_infinitely_bad(whole: bool) -> None:
     problem = search_of(small(whole=whole), criterion=Never())
-    rows = np.stack([random_configurations(problem.model.robot, 3, seed).ravel() for seed in range(3)])
+    rows = np.stack([random_configurations(problem.model.robot, 3, seed).ravel() for seed in range(4)])
     with np.errstate(all="raise", under="ignore"):
         value, gradient = (mean_objective if whole else plan_objective)(problem, 3)(rows)
-    assert np.isfinite(value).tolist() == [True, False, True] and value[1] == np.inf
-    assert np.isfinite(gradient).all() and not gradient[1].any()
+    assert np.isfinite(value).tolist() == [True, False, False, True] and (value[1:3] == np.inf).all()
+    assert np.isfinite(gradient).all() and not gradient[1:3].any()
 
 
 def test_copies_are_shaken_apart_where_that_is_feasible() -> None:
@@ -322,16 +325,19 @@ def test_starts_with_shared_errors_are_drawn_from_the_heavy_places(
 
 @pytest.mark.parametrize("kind", ["paper", "whole", "mask"])
 def test_a_part_of_the_search_tells_what_it_found_and_did(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The best of all descents to the end, its own log Ψ, and every evaluation and trial once."""
+    """The best of all descents to the end, its own log Ψ, and every evaluation and trial once. Along an edge that
+    says no more than yes or no, random steps and descents take turns, as long as a turn gains a thousandth."""
     space = small(whole=kind == "whole")
     if kind == "mask":
         fence = Custom("fence", lambda q: np.sin(3 * q[:, 0]) * np.cos(2 * q[:, 1]) > 0.3)
         space = plan_space(replace(space.problem, constraints=(fence,)))
     problem = search_of(space)
-    work, ends = [], [-np.inf]
+    work, ends, turns = [], [-np.inf], 0
 
     def counting(function: Any) -> Any:
         def counted(*args: Any, **settings: Any) -> Any:
+            nonlocal turns
+            turns += function is wander
             made = function(*args, **settings)
             work.append(made[1] if isinstance(made, tuple) else made.evaluations)
             if not isinstance(made, tuple):
@@ -340,6 +346,7 @@ def test_a_part_of_the_search_tells_what_it_found_and_did(kind: str, monkeypatch
 
         return counted
 
+    wander = multistart.wander
     for name in ("wander", "swapped", "descend_from"):
         monkeypatch.setattr(multistart, name, counting(getattr(multistart, name)))
     found = search_chunk(problem, 2 if kind == "whole" else 5, np.random.default_rng(0))
@@ -347,3 +354,7 @@ def test_a_part_of_the_search_tells_what_it_found_and_did(kind: str, monkeypatch
     assert found.log_value == max(ends)
     assert found.evaluations == sum(work) > 0
     assert space.feasibility.mask(found.configurations).all()
+    assert (turns > 0) == (kind == "mask")
+    if turns:
+        gains = np.diff(np.maximum.accumulate(ends[-1 - turns :]))
+        assert (gains[:-1] >= 1e-3).all() and (turns == EDGE_ROUNDS or gains[-1] < 1e-3)
