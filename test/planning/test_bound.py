@@ -479,6 +479,46 @@ def test_work_time_and_cancellation_end_a_proof_that_holds():
     assert (just.status, just.work, just.maximum_upper) == ("proven", whole.work, whole.maximum_upper)
 
 
+def test_a_proof_that_work_has_ended_is_taken_if_it_is_close():
+    problem = PlanProblem(Robot.load("kuka_kr270"), TEST_POSE, 4)
+    asked, rng = design_problem(plan_space(problem)), np.random.default_rng(0)
+    design = approximate_design(asked, problem.test_pose_array, rng)
+    _, whole = prove_bound(asked, design, np.random.default_rng(1))
+    found, proof = prove_bound(asked, design, np.random.default_rng(1), tolerance=1e-9, most_work=whole.work)
+    assert proof.status == "work" and proof.holds and proof.tolerance > 1e-9
+    assert found.bound == proof.ceiling(asked.prior, asked.visits) <= 1.002 * max(design.bound, design.value)
+
+
+@pytest.mark.parametrize(
+    ("slides", "turns", "usual", "required"),
+    [
+        (0, 2, "proven", "proven"),
+        (2, 4, "proven", "proven"),  # 5⁴ · 3² nodes
+        (2, 5, "work", "time_limit"),  # 5⁵ · 3² are more than 5⁶
+        (0, 7, "work", "time_limit"),
+        (0, 9, "joints", "joints"),
+    ],
+)
+def test_how_many_joints_a_proof_takes(slides, turns, usual, required):
+    """Where none is required, as many nodes as six turning joints have; else as many as eight."""
+    kinds = ["Tx", "Ty"][:slides] + ["Rz", "Ry", "Rx"] * 3
+    links = [
+        e
+        for k in range(slides + turns)
+        for e in (Element(kinds[k], 0.1, k), Element("Tz", 0.2, parameter=f"l{k}"))
+    ]
+    names = tuple(f"j{k}" for k in range(slides + turns))
+    robot = Robot("arm", tuple(links), (), names, np.array([[-0.3, 0.3]] * len(names)))
+    robot = robot.with_targets([[0.1, 0.0, 0.0]]).with_parameters("l1")
+    space = plan_space(PlanProblem(robot, np.zeros(len(names)), 4, noise=1.0, search=Search(general_weight=0.0)))
+    criterion, known = space.criterion("d"), np.zeros((1, len(names)))
+    some = prove_maximum(space.model, criterion, np.eye(1), known, most_work=1e9)
+    assert (some.status, some.holds) == (usual, usual == "proven")
+    # A proof that is required begins; here it is called off.
+    whole = prove_maximum(space.model, criterion, np.eye(1), known, cancel=lambda: required == "time_limit")
+    assert (whole.status, whole.holds) == (required, required != "joints")
+
+
 # ── what the planner makes of it ─────────────────────────────────────────────────────────────────────
 
 

@@ -39,6 +39,15 @@ def test_planar_is_equation_16():
     np.testing.assert_allclose(robot.positions(q)[:, 0], np.stack([x, y, 0 * x], axis=1), atol=1e-15)
 
 
+@pytest.mark.parametrize("length", [np.pi / 2, np.pi, -np.pi / 2, 2 * np.pi])
+def test_a_length_is_no_quarter_turn(length):
+    """Turns by quarters cost nothing; a link whose length is that number of metres is still that long."""
+    links = (Element("Rz", joint=0), Element("Tx", length), Element("Ry", length), Element("Tz", 1.0))
+    robot = Robot("arm", links, (), ("a",), np.array([[-1.0, 1.0]])).with_targets([[0.0, 0.0, 0.0]])
+    by_hand = [length + np.sin(length), 0.0, np.cos(length)]
+    np.testing.assert_allclose(robot.positions([0.0])[0, 0], by_hand, atol=1e-15)
+
+
 def test_deviations_as_argument_or_as_robot_agree():
     robot = mixed().with_parameters("full", ("base", "tool"))
     values = np.random.default_rng(0).normal(0, 0.02, len(robot.parameter_names))
