@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 from calib_planner import InfeasibleError, PlanProblem, Robot, plan
 from calib_planner.error_model import Prior
-from calib_planner.planning import Candidates, Search, bound, plan_space, planner
+from calib_planner.planning import Candidates, MinimumHeight, Search, bound, plan_space, planner
 from calib_planner.planning.bound import (
     DesignProblem,
     approximate_design,
@@ -534,6 +534,14 @@ def test_a_maximum_that_search_missed_is_found_and_repaired():
     bounded, proof = prove_bound(asked, wrong, rng)
     assert proof.status == "proven"
     assert bounded.bound == pytest.approx(good.bound, rel=5e-3)
+    # From a rough design, too, which grows to a good one on the way; constraints only add to what is proven.
+    rough = approximate_design(asked, problem.test_pose_array, rng, rounds=1)
+    rough = dataclasses.replace(rough, gradient=wrong.gradient)
+    grown, _ = prove_bound(asked, rough, rng)
+    assert 1.002 * rough.value < grown.value <= grown.bound == pytest.approx(good.bound, rel=5e-3)
+    walls = dataclasses.replace(asked.feasibility, constraints=(MinimumHeight(-9.0),))
+    walled, _ = prove_bound(dataclasses.replace(asked, feasibility=walls), rough, rng)
+    assert walled.value == rough.value and walled.bound == pytest.approx(good.bound, rel=5e-3)
 
 
 def test_noise_without_a_polynomial_stays_numerical_and_says_so():
