@@ -971,6 +971,11 @@ def test_rows_that_slipped_beside_sound_ones_in_numbers() -> None:
     assert told.statistic == told.deviations == pytest.approx(far / 1.6e-4, rel=0.3)
     assert told.gain == pytest.approx(-np.log(told.probability)) and not told.material
     assert explain_gross(robot, Measurements(robot.joint_names, q, noisy)) is None
+    exact = np.array(p)
+    exact[10:20] = p[11:21]
+    told = explain_gross(robot, Measurements(robot.joint_names, q, exact))
+    assert told is not None and told.statistic == told.deviations == told.moved / 1e-12  # for want of noise
+    assert told.probability == 0.0 and told.gain == pytest.approx(-np.log(1e-300))
     # With less than a tenth of the rows a robust fit copes by itself; and as few as two are no run.
     for count, order, named in ((40, [11, 12, 10], False), (20, [11, 12, 10], True), (15, [11, 10, 12], False)):
         few = np.array(noisy)

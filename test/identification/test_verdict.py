@@ -633,7 +633,7 @@ def test_blind_test_poses_are_counted() -> None:
     assert "blind_test_pose" not in told("terms")
 
 
-@pytest.mark.parametrize("points", [1, 4, 20, 200])
+@pytest.mark.parametrize("points", [1, 4, 15, 20, 200])
 def test_few_points_outside_of_their_region_are_chance(points: int) -> None:
     """Fewer than 80 % inside, and as few inside of so many happens once in a hundred times by chance at most."""
     for inside in range(points + 1):
