@@ -561,6 +561,21 @@ def test_candidates_are_proven_by_looking_at_every_candidate():
     assert found.quality.lower_bound <= found.quality.predicted_accuracy * (1 + SLACK)
 
 
+def test_the_proof_over_candidates_is_the_largest_sensitivity_of_any():
+    robot = Robot.load("kuka_kr270")
+    pool = random_configurations(robot, 40, 2)
+    prior = Prior(("d1",), [0.0], [1e-4])
+    space = plan_space(PlanProblem(robot, TEST_POSE, 5, candidates=Candidates(pool), prior=prior))
+    asked = dataclasses.replace(design_problem(space), candidates=pool)
+    design = approximate_design(asked, pool, np.random.default_rng(0))
+    same, proof = prove_bound(asked, design, np.random.default_rng(0))
+    assert same is design and (proof.status, proof.boxes, proof.seconds) == ("candidates", 40, 0.0)
+    heights = np.einsum("nab,ab->n", space.single.at(pool), design.gradient)
+    assert proof.maximum_upper == proof.largest_seen == pytest.approx(heights.max(), rel=1e-9)
+    assert proof.ceiling(asked.prior, 5) >= design.value
+    assert any((proof.where == q).all() for q in pool)
+
+
 def test_every_plan_tries_a_proof_and_says_what_it_is_worth():
     robot = Robot.load("kuka_kr270")
     found = plan(PlanProblem(robot, TEST_POSE, 12, search=Search(starts=4)))

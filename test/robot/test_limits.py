@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import CASES
 
 from calib_planner import InputError, Robot
 from calib_planner.robot import believable_limits, check_reflectors, limit_remarks
@@ -75,10 +74,13 @@ def test_what_is_said_alike_is_one_sentence() -> None:
 
 
 def test_a_reflector_is_no_farther_than_the_arm_is_long_or_than_a_metre() -> None:
-    """The planar arm is 1.8 m long; the same with links of a fourth may still carry a metre."""
+    """The planar arm is 1.8 m long; with links of a fourth it may still carry a metre. All segments count, from the
+    base on, wherever that stands."""
     robot = Robot.load("planar_2r")
+    large = Robot.load("kuka_kr270").with_base(np.eye(3), [3.0, -1.0, 2.0])
+    length = 0.75 + 0.35 + 1.25 + np.hypot(0.055, 1.1) + 0.23
     short = robot.with_deviations({"l1": -0.75, "l2": -0.6})
-    for arm, most in ((robot, 1.8), (short, 1.0)):
+    for arm, most in ((robot, 1.8), (short, 1.0), (large, length)):
         for way in ([0.0, 0.6, 0.8], [-1.0, 0.0, 0.0]):
             near, far = ((most + d) * np.array(way) for d in (-1e-6, 1e-6))
             check_reflectors(arm.with_targets([near, 0.5 * near]))
@@ -87,6 +89,3 @@ def test_a_reflector_is_no_farther_than_the_arm_is_long_or_than_a_metre() -> Non
             ) as caught:
                 check_reflectors(arm.with_targets([near, far, far]), "tool")
             assert f"{most:.3g}" in str(caught.value)
-    # Capsules: the base's column counts as part of the chain.
-    moved = CASES["kuka_kr270"]()
-    check_reflectors(moved.with_targets([[2.5, 0.0, 0.0]]))
