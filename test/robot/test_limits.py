@@ -74,7 +74,7 @@ def test_what_is_said_alike_is_one_sentence() -> None:
 
 
 def test_a_reflector_is_no_farther_than_the_arm_is_long_or_than_a_metre() -> None:
-    """1.8 m of planar arm; a shorter one may still carry a metre. All segments count, wherever the base stands."""
+    """1.8 m of planar arm; a shorter one may still carry a metre. All segments count, wherever the base is."""
     robot = Robot.load("planar_2r")
     large = Robot.load("kuka_kr270").with_base(np.eye(3), [3.0, -1.0, 2.0])
     length = 0.75 + 0.35 + 1.25 + np.hypot(0.055, 1.1) + 0.23
