@@ -42,7 +42,8 @@ def rejected_since(seen: NDArray[np.bool_], use: NDArray[np.bool_]) -> int | Non
     rows = np.flatnonzero(seen.any(axis=1))
     gone = np.asarray(~use[rows].any(axis=1))
     count = int(gone.sum())
-    if not count or count == len(rows) or not gone[-count:].all() or comb(len(rows), count) * CHANCE < 1.0:
+    # To reject none or all there is one choice only, which is no sign.
+    if not gone[-count:].all() or comb(len(rows), count) * CHANCE <= 1.0:
         return None
     return int(rows[-count])
 
@@ -72,8 +73,7 @@ def explain(
                     words[int(i), int(t)] = f"fits target {targets[k] + 1}: targets exchanged?"
                 continue
         apart = np.linalg.norm(predicted[:, targets] - data.p[i, targets], axis=2)
-        # One of the points may be wrong besides.
-        apart = np.median(apart, axis=1) if len(targets) > 1 else apart[:, 0]
+        apart = np.median(apart, axis=1)  # one of the points may be wrong besides
         apart[i] = np.inf
         k = int(apart.argmin())
         if apart[k] < reach:

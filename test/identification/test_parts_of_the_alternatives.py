@@ -440,7 +440,7 @@ def test_of_many_visits_one_alternative_is_named_at_the_scales_of_the_estimate(
     assert told.size == pytest.approx(float(wide.coefficients[-1]), rel=1e-6)
     statistic = _answer(fit.solution, question, _statistics(fit.solution, [question.columns])[0], 1.0)
     assert told.statistic == pytest.approx(statistic.statistic, rel=1e-6) and told.freedom == 1
-    assert told.probability == pytest.approx(statistic.probability * 168.0, rel=1e-6)
+    assert told.probability == pytest.approx(statistic.probability * 168.0, rel=1e-6, abs=0.0)
 
 
 def test_points_that_are_put_back_gain_what_the_fit_to_the_right_points_has() -> None:
@@ -954,7 +954,7 @@ def test_every_change_that_was_tried_counts_against_the_one_that_is_named() -> N
     start = one._change("", one.q, one.p)
     number = len(list(one._changes(start))) + len(list(one._fitted_changes(start)))
     assert told is not None and told.code == "sign" and 20.0 < told.gain < 600.0 and number > 15
-    assert told.probability == pytest.approx(number * np.exp(-told.gain), rel=1e-9)
+    assert told.probability == pytest.approx(number * np.exp(-told.gain), rel=1e-9, abs=0.0)
 
 
 def test_rows_that_slipped_beside_sound_ones_in_numbers() -> None:

@@ -112,6 +112,7 @@ def test_rows_that_are_copies_are_counted() -> None:
     q = random_configurations(robot, 4, 1)[[0, 1, 0, 2, 0, 3]]
     points = robot.positions(q).copy()
     assert copied_rows(Measurements(robot.joint_names, q, points)) == 2
+    assert copied_rows(Measurements(robot.joint_names, q[[2, 2, 2, 2]], points[[2, 2, 2, 2]])) == 3
     points[2] += 1e-9
     points[1] = points[3] = np.nan
     assert copied_rows(Measurements(robot.joint_names, q, points)) == 1
@@ -124,6 +125,8 @@ def test_rows_that_are_copies_are_counted() -> None:
         (40, (34, 36, 37, 38, 39), None),  # not the last ones
         (40, range(38, 40), None),  # one of 780: it may be chance
         (46, range(44, 46), 44),  # one of 1035
+        (1000, range(999, 1000), None),  # one of a thousand is not less than that
+        (1001, range(1000, 1001), 1000),
         (40, range(40), None),
         (40, (), None),
     ],
@@ -145,12 +148,13 @@ def test_what_happened_to_points_that_fit_elsewhere() -> None:
     points[1, [0, 2]] = points[1, [2, 0]]
     rejected[1, [0, 2]] = True
     points[[3, 4]] = points[[4, 3]]
+    points[3, 0] += 0.2  # wrong besides
     rejected[[3, 4]] = True
     points[6, 1] = predicted[2, 1] + 2e-5
     rejected[6, 1] = True
     points[7, 0] += 0.3
     rejected[7, 0] = True
-    points[5] = points[5, [1, 2, 0]]
+    points[5] = points[5, [1, 2, 1]]
     rejected[5] = True
     words = explain(predicted, Measurements(robot.joint_names, q, points), rejected, 1e-4)
     expected = {
@@ -159,7 +163,7 @@ def test_what_happened_to_points_that_fit_elsewhere() -> None:
         (6, 1): "fits the configuration of row 2: rows exchanged?",
         (5, 0): "fits target 2: targets exchanged?",
         (5, 1): "fits target 3: targets exchanged?",
-        (5, 2): "fits target 1: targets exchanged?",
+        (5, 2): "fits target 2: targets exchanged?",
     }
     for target in range(3):
         expected[3, target] = "fits the configuration of row 4: rows exchanged?"
