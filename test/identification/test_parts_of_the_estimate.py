@@ -241,10 +241,14 @@ def test_what_the_fit_leaves_counts_configurations_once_and_parameters_by_what_t
     points = robot.positions(q) + SIGMA * np.random.default_rng(0).standard_normal((11, 1, 3))
     points[2] = points[5] = np.nan
     model = replace(typical(), joint_functions=None)
-    fit = identify(
+    estimate = identify(
         IdentificationProblem(robot, Measurements(robot.joint_names, q, points), error_model=model)
-    ).model_fit
+    )
+    fit = estimate.model_fit
     assert fit is not None and len(set(fit.left_out.groups.tolist())) == 9
+    names, covariance = fit.origin.scales
+    assert names and estimate.scale_spread == dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+    assert replace(estimate, model_fit=None).scale_spread == {}  # as it is read from a file
     variances = fit.knowledge.model.variances(fit.knowledge.robot)[:4]
     told = 1.0 - np.diag(fit.knowledge.covariance)[:4] / variances
     assert np.isfinite(variances).all() and (told > 0.0).all() and (told < 1.0).all() and told.min() < 0.95

@@ -27,6 +27,7 @@ from calib_planner.identification import (
 from calib_planner.measurements import RejectedPoint
 from calib_planner.simulation import SimulatedCell
 from calib_planner.tracker import Isotropic
+from calib_planner.units import length
 
 KUKA = Robot.load("kuka_kr270")
 PAPER = ErrorModel.paper()
@@ -651,3 +652,16 @@ def test_held_out_points_are_to_be_better_than_before_and_as_predicted() -> None
         assert ("no_gain_held_out" in got) == there
     assert "predicted_and_achieved" not in levels("terms", validation={"predicted_rms": np.inf})
     assert "predicted_and_achieved" in levels("terms")
+
+
+def test_an_estimate_in_one_line() -> None:
+    """What nobody asked for is not in it."""
+    whole, plain = sound("terms"), replace(sound("no poses"), validation=None)
+    assert repr(whole) == (
+        f"Estimate(verdict {whole.verdict.level}, robot kuka_kr270, parameters {whole.observability.rank} of "
+        f"{len(whole.fit.parameters)} identified, points 25 of 25 used, before {length(whole.residuals.before.rms)} "
+        f"rms, after {length(whole.residuals.after.rms)} rms, left out {length(whole.left_out.rms)} rms, held out "
+        f"{length(whole.validation.rms)} rms, at test poses {length(whole.accuracy.overall)})"
+    )
+    assert "left out" in repr(plain) and "held out" not in repr(plain) and "test poses" not in repr(plain)
+    assert "left out" not in repr(replace(plain, left_out=replace(plain.left_out, count=0)))
