@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from calib_planner.planning import (
     random_accuracies,
     split_budget,
     visit_times,
+    visiting_order,
 )
 from calib_planner.planning.budget import _Tour
 from calib_planner.planning.planner import value_of
@@ -56,7 +58,9 @@ def planned():
 @pytest.mark.parametrize("accuracy", [0.9, 0.55, 0.3])
 def test_fewest_measurements_of_the_two_link_arm(accuracy):
     """Equation (20): n ≥ (1 + |sin q20|) / ρ²; the split found uses exactly that many."""
-    found = plan_for_accuracy(two_link(), accuracy)
+    told = []
+    found = plan_for_accuracy(two_link(), accuracy, lambda *done: told.append(done))
+    assert told == [(k + 1, 6) for k in range(len(told))] and told
     least = max(int(np.ceil((1 + np.sin(np.radians(50.0))) / accuracy**2)), 1)
     assert found.plan.quality.value <= accuracy
     assert found.fewest <= least <= found.plan.measurements <= least + 1
@@ -65,7 +69,9 @@ def test_fewest_measurements_of_the_two_link_arm(accuracy):
 def test_accuracy_with_an_error_that_repetition_does_not_average():
     """σ_c makes repetition worth less: more configurations, and still the accuracy asked for."""
     plain = plan_for_accuracy(two_link(), 0.4).plan
-    rough = plan_for_accuracy(two_link(configuration_sigma=2 / 3), 0.4).plan
+    split = plan_for_accuracy(two_link(configuration_sigma=2 / 3), 0.4)
+    rough = split.plan
+    assert split.fewest == 0  # not known
     assert plain.quality.value <= 0.4
     assert rough.quality.value <= 0.4
     assert rough.measurements > plain.measurements
@@ -206,6 +212,103 @@ def test_the_gain_of_a_visit_is_that_of_the_criterion(model):
         one = (np.arange(9) == i).astype(int)
         slope = (tour.log_value(counts + one) - tour.log_value(counts - one)) / 2
         assert gains[i] == pytest.approx(slope, rel=1e-2)
+
+
+def tours():
+    """Tours of paper and whole models with the same seven configurations, and one of eleven."""
+    request = problem(search=Search(starts=2, general_weight=0.0))
+    for model, count in ((None, 7), (WHOLE, 7), (None, 11)):
+        sized = replace(request, configurations=count, error_model=model)
+        q = random_configurations(request.robot, count, 3)
+        yield _Tour((plan_space(sized),), q, SLOW, None)
+
+
+def test_visits_are_given_away_to_the_last_and_the_time_is_kept():
+    for tour in tours():
+        for extra in (0, 1, 2, 7, 61):
+            counts = tour._given_away(tour.once, extra)
+            assert counts.sum() == len(tour.once) + extra and counts.min() >= 1
+        for spare in (0.0, 3.0, 40.0, 333.0):
+            whole = tour.seconds(tour.once) + spare
+            counts = tour.filled(whole)
+            assert tour.seconds(counts) <= whole and counts.min() >= 1
+            assert whole - tour.seconds(counts) < 2 * (SLOW.standstill + 4)
+
+
+def test_few_visits_reach_an_accuracy_and_one_fewer_does_not(monkeypatch):
+    monkeypatch.setattr(budget, "MOST_MEASUREMENTS", 100)
+    for tour in list(tours())[:2]:
+        once = tour._accuracy(tour.once)
+        np.testing.assert_array_equal(tour.enough(once), tour.once)
+        for share in (0.9, 0.5):
+            counts = tour.enough(share * once)
+            if counts is None:
+                assert tour.spaces[0].problem.error_model is not None  # what repeats is not averaged
+                continue
+            assert tour._accuracy(counts) <= share * once
+            fewer = tour._given_away(tour.once, int(counts.sum()) - len(counts) - 1)
+            assert tour._accuracy(fewer) > share * once
+        assert tour.enough(1e-4 * once) is None
+
+
+def test_numbers_of_configurations_that_are_tried():
+    """One by one, then a quarter more each time; for a time half as many again, up or down to the end."""
+    assert list(budget._sizes(3)) == [3, 4, 5, 6, 7, 8, 9, 12, 15, 19, 24, 30, 38, 48, 60]
+    assert list(budget._sizes(50)) == [50, 51, 52, 53, 54, 55, 56]
+    assert budget._steps(4, 30) == [4, 6, 9, 14, 21, 30] and budget._steps(1, 4) == [1, 2, 3, 4]
+    assert budget._steps(30, 4) == [30, 20, 13, 9, 6, 4] and budget._steps(3, 1) == [3, 2, 1]
+    assert budget._steps(5, 5) == [5]
+
+
+@pytest.mark.parametrize("start", [4, 20, 60])
+@pytest.mark.parametrize("peak", [4, 7, 13, 22, 41, 60])
+def test_the_best_number_is_found_of_what_rises_and_then_falls(peak, start):
+    """As all numbers together say, but for those too close to tell apart; and few of them are tried."""
+    for steepness in (0.3, 3.0):
+        told = []
+        worth = {m: -steepness * np.log(m / peak) ** 2 for m in range(4, 61)}
+        tried = []
+
+        def attempt(m, worth=worth, tried=tried):
+            tried.append(m)
+            return SimpleNamespace(merit=worth[m], counts=np.full(m, 5), size=m)
+
+        ways = (budget._steps(start, 4), budget._steps(start, 60))
+        best, every = budget._best_size(attempt, ways, lambda *done, told=told: told.append(done))
+        assert len(set(tried)) == len(tried) == len(every) <= 14
+        assert [one.size for one in every] == sorted(tried) and best.merit == max(one.merit for one in every)
+        assert max(best.size / peak, peak / best.size) <= budget.CLOSE + 0.5 / min(peak, best.size)
+        assert [done for done, _ in told] == list(range(1, len(tried) + 1))
+        assert all(total >= max(done, 6) for done, total in told)
+
+
+def test_of_no_number_that_comes_to_something_there_is_none():
+    """And where only the smaller ones do, they are found from a larger one."""
+    ways = (budget._steps(20, 4), budget._steps(20, 60))
+    assert budget._best_size(lambda m: None, ways, lambda *done: None) == (None, [])
+    some = lambda m: SimpleNamespace(merit=float(m), counts=np.full(m, 5), size=m) if m <= 13 else None  # noqa: E731
+    best, every = budget._best_size(some, ways, lambda *done: None)
+    assert 13 / budget.CLOSE <= best.size <= 13 and best in every
+
+
+def test_about_as_many_fit_as_of_random_ones():
+    request = problem()
+    for seconds in (500.0, 1200.0):
+        got = budget._most_that_fit(request, SLOW, seconds, None, (3, 60))
+        q = random_configurations(request.robot, 60, 9)
+
+        def time(m, q=q):
+            return visit_times(
+                request.robot, q[:m][visiting_order(q[:m], request.robot, SLOW, None)], 1, SLOW
+            ).seconds
+
+        assert time(int(0.75 * got)) < seconds < time(int(1.3 * got) + 1)
+    assert budget._most_that_fit(request, SLOW, 1e5, None, (3, 60)) == 60
+    assert budget._most_that_fit(request, SLOW, 1.0, None, (3, 60)) == 3
+    near = replace(request, candidates=Candidates(POSE + 1e-3 * random_configurations(request.robot, 20, 3)))
+    assert budget._most_that_fit(near, SLOW, 500.0, None, (3, 20)) > 1.3 * budget._most_that_fit(
+        request, SLOW, 500.0, None, (3, 20)
+    )
 
 
 def test_unequal_visits_promise_what_their_rows_promise():

@@ -24,6 +24,7 @@ from calib_planner.planning import (
     TrackerElevation,
     TrackerRange,
     WorkspaceBox,
+    feasibility,
 )
 from calib_planner.planning.constraints import Custom
 from calib_planner.robot import Capsules
@@ -365,6 +366,43 @@ def test_many_configurations_are_uniform_unless_they_are_rare():
     fresh = fresh[box.mask(fresh)]
     error = np.hypot(q.std(axis=0) / len(q) ** 0.5, fresh.std(axis=0) / len(fresh) ** 0.5)
     assert (np.abs(q.mean(axis=0) - fresh.mean(axis=0)) < 4.5 * error).all()
+
+
+def counting(inner):
+    """A constraint, and how many configurations it was asked about each time."""
+    asked = []
+
+    def function(q):
+        asked.append(len(q))
+        return inner(q)
+
+    return Feasibility(planar(), (Custom("counting", function),)), asked
+
+
+def test_no_more_configurations_are_drawn_than_the_share_of_feasible_ones_calls_for(monkeypatch):
+    """One draw is enough where half of all is feasible; rejection goes on while one in a hundred is, and ends
+    with patience where fewer are."""
+    (low, high), rng = planar().joint_limits[0], np.random.default_rng(0)
+    monkeypatch.setattr(feasibility, "PATIENCE", 2000)
+    half, asked = counting(lambda q: q[:, 0] > 0.5 * (low + high))
+    assert len(half.sample(rng, 1000)) == 1000 and len(asked) == 1 and asked[0] <= 5000
+    some, asked = counting(lambda q: q[:, 0] > high - 0.02 * (high - low))
+    assert len(some.sample(rng, 500)) == 500 and sum(asked) > 0.8 * 500 / 0.02
+    few, asked = counting(lambda q: q[:, 0] > high - 0.001 * (high - low))
+    assert len(few.sample(rng, 300)) == 300 and sum(asked) < 0.5 * 300 / 0.001
+
+
+def test_neighbours_are_near_as_far_as_there_is_room_for_them():
+    """Steps of a tenth of the range, as long as enough of them are feasible; else as short as they have to be."""
+    low, high = planar().joint_limits.T
+    middle = 0.5 * (low + high)
+    wide, asked = counting(lambda q: np.ones(len(q), bool))
+    q = wide._multiplied(np.random.default_rng(0), middle[None], 4000)[1:]
+    assert len(asked) == 1
+    np.testing.assert_allclose(q.std(axis=0) / (high - low), 0.1, rtol=0.05)
+    assert ((low < q) & (q < high)).all()
+    tiny, asked = counting(lambda q: (np.abs(q - middle) < 1e-3 * (high - low)).all(axis=1))
+    assert len(tiny._multiplied(np.random.default_rng(0), middle[None], 3000)) >= 3000 and len(asked) < 20
 
 
 def test_joint_ranges_cost_nothing_however_narrow():

@@ -274,6 +274,28 @@ def test_steps_end_inside_and_keep_what_the_tangent_promised():
     assert np.median(share[outside]) > 0.8
 
 
+def test_one_edge_brings_back_and_where_nothing_else_is_allowed_a_configuration_stays():
+    robot = Robot.load("planar_2r")
+    wall = WorkspaceBox([1.2, -np.inf, -np.inf], [np.inf] * 3)
+    walls = PlanWalls(Feasibility(robot, (wall,)), 1)
+    q = walls.feasibility.sample(np.random.default_rng(1), 2000)
+    q = q[(walls.margins(q)[:, 0, 0] < 0.05) & (np.abs(robot.joint_jacobian(q)[:, 0, 1]) > 0.1)]
+    margins, normals = walls.margins(q), walls.normals(q)
+    assert margins.shape == (len(q), 1, 1)
+    a = normals[:, 0, 0]
+    along = np.stack([-a[:, 1], a[:, 0]], axis=1) / np.linalg.norm(a, axis=1)[:, None]
+    new = q + 0.2 * along - 0.9 * margins[:, 0] * a / np.sum(a**2, axis=1)[:, None]
+    outside = ~walls.feasibility.mask(new)
+    reached, _ = walls.step(q, new, margins, normals)
+    share = np.linalg.norm(reached - q, axis=1) / np.linalg.norm(new - q, axis=1)
+    assert outside.sum() > 5 and np.median(share[outside]) > 0.8
+    allowed = q.copy()
+    here = Custom("here", lambda rows: (np.abs(rows[:, None] - allowed[None]).max(axis=2) < 1e-12).any(axis=1))
+    fixed = PlanWalls(Feasibility(robot, (here,)), 1)
+    stayed, _ = fixed.step(q, new, fixed.margins(q), fixed.normals(q))
+    np.testing.assert_array_equal(stayed, q)
+
+
 def test_constraints_give_margins_or_only_masks():
     robot, feasible = room()
     q = feasible.sample(np.random.default_rng(3), 50)

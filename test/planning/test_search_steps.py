@@ -12,6 +12,7 @@ import pytest
 from robots import mixed, random_configurations
 
 from calib_planner import InputError, PlanProblem, Robot
+from calib_planner.error_model import Prior, typical
 from calib_planner.planning import Custom, Feasibility, InformationModel, plan_space, random_plans
 from calib_planner.planning.criteria import Determinant, log_values, ridged
 from calib_planner.planning.search import enumeration
@@ -287,21 +288,47 @@ def test_a_timetable_is_what_a_robot_that_does_one_thing_after_the_other_needs(k
     assert points[-1] == (q[3].tolist(), round(clock * 1e9))
 
 
-def test_random_plans_have_the_accuracy_of_their_configurations(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("noise", "size", "batches"), [(3e-5, 4, (3, 3, 1)), (1.0, 2, (6, 1))])
+@pytest.mark.parametrize("known", [False, True])
+def test_random_plans_have_the_accuracy_of_their_configurations(
+    noise: float, size: int, batches: tuple[int, ...], known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each batch draws its plans with a seed of its own; ρ0 = σ √tr(J₀ (Σ JᵀJ)⁻¹ J₀ᵀ), eq. (14)."""
     monkeypatch.setattr(random_plans, "BATCH", 12)
     robot = Robot.load("kuka_kr270").with_parameters("d1,q2,d2")
-    pose = random_configurations(robot, 1, 3)
-    space = plan_space(PlanProblem(robot, pose, 4, repetitions=2, noise=3e-5))
+    pose, std = random_configurations(robot, 1, 3), noise * np.array([0.3, 0.5, 2.0])
+    prior = Prior(list(robot.parameter_names), np.zeros(3), std) if known else None
+    space = plan_space(PlanProblem(robot, pose, size, repetitions=2, noise=noise, prior=prior))
     got = random_plans.random_accuracies(space, 7, np.random.default_rng(5))
-    seeds, expected = np.random.default_rng(5).integers(0, 2**63, 3).tolist(), []
-    for many, seed in zip((3, 3, 1), seeds, strict=True):
-        q = space.feasibility.sample(np.random.default_rng(seed), 4 * many).reshape(many, 4, -1)
+    seeds, expected = np.random.default_rng(5).integers(0, 2**63, len(batches)).tolist(), []
+    before = np.diag((noise / std) ** 2) if known else np.zeros((3, 3))
+    for many, seed in zip(batches, seeds, strict=True):
+        q = space.feasibility.sample(np.random.default_rng(seed), size * many).reshape(many, size, -1)
         j0 = robot.jacobian(pose)[0]
         for plan in q:
-            jacobian = robot.jacobian(plan).reshape(12, 3)
-            expected.append(3e-5 * np.sqrt(np.trace(j0 @ np.linalg.inv(2.0 * jacobian.T @ jacobian) @ j0.T)))
+            jacobian = robot.jacobian(plan).reshape(-1, 3)
+            hidden = np.linalg.inv(before + 2.0 * jacobian.T @ jacobian)
+            expected.append(noise * np.sqrt(np.trace(j0 @ hidden @ j0.T)))
     np.testing.assert_allclose(got, expected, rtol=1e-6)
+    assert noise < 1.0 or known or (got > 1.0).any()
+
+
+@pytest.mark.parametrize(("most", "batches"), [(110, (2, 2, 2, 1)), (30, (1,) * 7)])
+def test_random_plans_with_a_whole_error_model_go_in_smaller_batches(
+    most: int, batches: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tenth at once: of 110 configurations 11, two plans of four; and one plan at least."""
+    monkeypatch.setattr(random_plans, "BATCH", most)
+    robot = Robot.load("planar_2r").with_parameters("l1,l2")
+    pose = random_configurations(robot, 1, 3)
+    space = plan_space(PlanProblem(robot, pose, 4, error_model=typical(Isotropic(3e-5))))
+    got = random_plans.random_accuracies(space, 7, np.random.default_rng(5))
+    expected, seeds = [], np.random.default_rng(5).integers(0, 2**63, len(batches)).tolist()
+    for many, seed in zip(batches, seeds, strict=True):
+        q = space.feasibility.sample(np.random.default_rng(seed), 4 * many)
+        matrices, weight = space.model.totals(q, 4) + space.prior, space.criterion("test_pose").weight  # type: ignore[attr-defined]
+        expected += [np.sqrt(np.trace(weight @ np.linalg.inv(matrix))) for matrix in matrices]
+    np.testing.assert_allclose(got, expected, rtol=1e-9)
 
 
 def test_a_tour_may_be_as_long_as_a_duration_can_say(monkeypatch: pytest.MonkeyPatch) -> None:
