@@ -657,11 +657,12 @@ def test_held_out_points_are_to_be_better_than_before_and_as_predicted() -> None
 def test_an_estimate_in_one_line() -> None:
     """What nobody asked for is not in it."""
     whole, plain = sound("terms"), replace(sound("no poses"), validation=None)
+    before, after = whole.residuals.before.rms, whole.residuals.after.rms
+    left, tested, there = whole.left_out.rms, whole.validation.rms, whole.accuracy.overall
     assert repr(whole) == (
-        f"Estimate(verdict {whole.verdict.level}, robot kuka_kr270, parameters {whole.observability.rank} of "
-        f"{len(whole.fit.parameters)} identified, points 25 of 25 used, before {length(whole.residuals.before.rms)} "
-        f"rms, after {length(whole.residuals.after.rms)} rms, left out {length(whole.left_out.rms)} rms, held out "
-        f"{length(whole.validation.rms)} rms, at test poses {length(whole.accuracy.overall)})"
+        f"Estimate(verdict {whole.verdict.level}, robot kuka_kr270, parameters 9 of 9 identified, "
+        f"points 25 of 25 used, before {length(before)} rms, after {length(after)} rms, "
+        f"left out {length(left)} rms, held out {length(tested)} rms, at test poses {length(there)})"
     )
     assert "left out" in repr(plain) and "held out" not in repr(plain) and "test poses" not in repr(plain)
     assert "left out" not in repr(replace(plain, left_out=replace(plain.left_out, count=0)))
