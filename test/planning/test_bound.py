@@ -360,6 +360,9 @@ def test_the_maximum_of_a_polynomial_is_enclosed(shape, seed, monkeypatch):
         assert found.largest <= top * (1 + 1e-9)
         assert ((low - 1e-12 <= found.where) & (found.where <= high + 1e-12)).all()
         assert values_of(axes, tensor, found.where[None])[0] == pytest.approx(found.largest, rel=1e-12)
+    tiny = maximise(axes, 2.0**-40 * tensor, 0.0, tolerance=1e-6)  # a power of two: the same digits
+    assert (tiny.upper, tiny.largest) == (2.0**-40 * found.upper, 2.0**-40 * found.largest)
+    assert tiny.boxes == found.boxes and tiny.where.tolist() == found.where.tolist()
     known = maximise(axes, tensor, top, tolerance=1e-2)
     assert known.largest == top or known.largest == pytest.approx(top, rel=1e-9)
     assert known.boxes <= maximise(axes, tensor, 0.0, tolerance=1e-2).boxes
