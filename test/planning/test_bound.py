@@ -221,12 +221,12 @@ def test_the_allowance_is_for_every_operation_and_for_what_is_dropped():
     for robot in (Robot.load("planar_2r"), mixed().with_parameters("offsets")):
         space = plan_space(PlanProblem(robot, np.zeros(len(robot.joint_names)), 8))
         root = np.random.default_rng(0).normal(size=(space.prior.shape[0], 3))
-        root *= 1.0 / np.linalg.norm(root)
+        root *= 30.0 / np.linalg.norm(root)
         q = random_configurations(robot, 10_000, 2)  # more than a block
         d, error = sensitivity(space.single, root, q)
         rows = space.single.whitened(q)
         np.testing.assert_allclose(d, np.sum((rows @ root) ** 2, axis=(1, 2)), rtol=1e-12)
-        size = np.sqrt(np.sum(rows**2, axis=(1, 2)).max())
+        size = np.sqrt(np.sum(rows**2, axis=(1, 2)).max()) * 30.0
         steps = len(robot.elements) + 2 * len(root)
         assert 2 * np.sqrt(d.max()) * EPS * steps * size <= error <= 20 * np.sqrt(d.max()) * EPS * steps * size
         found = polynomial(space.single, root)

@@ -99,6 +99,7 @@ def test_parameter_requests(request_, unknown, names):
         (lambda r: r.with_parameters("q1,q1"), "parameters", "at most once"),
         (lambda r: r.with_parameters("q1", ("tracker",)), "unknown", "base, tool"),
         (lambda r: r.positions(np.zeros(5)), "configurations", "joint_a1"),
+        (lambda r: r.positions(np.zeros((2, 7))), "configurations", "joint_a1"),
         (lambda r: r.positions(np.full(6, np.nan)), "configurations", "finite"),
         (lambda r: r.positions(np.zeros((2, 3, 6))), "configurations", "shape (2, 3, 6)"),
         (lambda r: r.positions([["a"] * 6]), "configurations", "rad or m"),
