@@ -98,7 +98,7 @@ def test_same_seed_same_campaign():
 @pytest.mark.parametrize("seed", repeats([1], [0, 1, 2, 3]))
 def test_more_noise_than_stated_is_noticed_and_measured_away(seed):
     def result(sigma: float) -> CampaignResult:
-        problem = planar(repeats(90e-6, 60e-6), seed, budget=200, identification=TYPICAL)
+        problem = planar(repeats(90e-6, 60e-6), seed, budget=200, batch=20, identification=TYPICAL)
         return campaign(problem, world_of(problem.robot, seed, sigma))
 
     plain, noisy = result(SIGMA), result(3 * SIGMA)
@@ -109,7 +109,7 @@ def test_more_noise_than_stated_is_noticed_and_measured_away(seed):
 
 def test_less_noise_than_stated_saves_measurements():
     def result(sigma: float) -> CampaignResult:
-        problem = planar(repeats(45e-6, 30e-6), 1, budget=200, identification=TYPICAL)
+        problem = planar(repeats(45e-6, 30e-6), 1, budget=200, batch=20, identification=TYPICAL)
         return campaign(problem, world_of(problem.robot, 1, sigma))
 
     quiet, honest = result(0.3 * SIGMA), result(SIGMA)
@@ -121,11 +121,11 @@ def test_less_noise_than_stated_saves_measurements():
 def test_errors_of_the_joints_are_learnt_and_never_denied(seed):
     """0.4 mrad in every joint: they are learnt, or, by a model without them, the accuracy is not reached."""
     world = world_of(kuka().robot, seed, transmission=4e-4)
-    learnt = campaign(kuka(150e-6, seed, budget=120, identification=TYPICAL), world)
+    learnt = campaign(kuka(150e-6, seed, budget=120, batch=20, identification=TYPICAL), world)
     assert {"smooth", "short"} & {t.name for t in learnt.estimate.terms if t.used}
     assert learnt.outcome == "reached" and learnt.verdict.level != "FAIL"
     assert achieved(learnt, world, POSE) < 150e-6
-    stopped = campaign(kuka(60e-6, seed, budget=60), world)
+    stopped = campaign(kuka(60e-6, seed, budget=60, batch=20), world)
     assert stopped.outcome == "budget_spent" and stopped.verdict.level == "FAIL"
 
 
@@ -138,7 +138,7 @@ def test_noise_is_measured_away_and_repeatability_is_not():
         ("noise", world_of(planar().robot, 5, sigma=4 * SIGMA)),
         ("visits", world_of(planar().robot, 5, model=visits)),
     ):
-        result = campaign(planar(100e-6, 5, budget=200, identification=TYPICAL), world)
+        result = campaign(planar(100e-6, 5, budget=200, batch=20, identification=TYPICAL), world)
         outcomes[name] = result.outcome
     assert outcomes == {"noise": "reached", "visits": "limited"}
     assert "of repeatability" in result.message and result.spent < 100
