@@ -48,8 +48,8 @@ def record_bag(folder: Path) -> None:
     write_bag(folder / "monday_1", campaign(cell, stops), ("/joint_states", "/leica/point"))
 
 
-LONG = ("how-many.md",)
-"""Pages whose commands other pages have, too, and whose examples take long: ``make prove`` runs them."""
+LONG = ("how-many.md", "scaling.md")
+"""Pages whose commands other pages or tests have, too, and whose examples take long: ``make prove`` runs them."""
 PREPARED: dict[str, Callable[[Path], None]] = {"docs/real-robot-data.md": record_bag}
 
 

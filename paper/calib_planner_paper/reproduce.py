@@ -152,7 +152,6 @@ def publish(result: Reproduction, folder: str | Path) -> None:
         "figure_3": [draw_two_link_figure(result.figure_3, narrow=n) for n in (False, True)],
         "figure_5": [draw_figure_5(result.figure_5, narrow=n) for n in (False, True)],
     }
-    pictures = {name: (svg(wide), svg(narrow)) for name, (wide, narrow) in drawn.items()}
     for name, (wide, _) in drawn.items():
         try:
             alone = titled(wide, name)
@@ -163,6 +162,7 @@ def publish(result: Reproduction, folder: str | Path) -> None:
             raise InputError("output", got, "a folder that can be written", "choose another") from None
     text = json.dumps(result.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
     write_text(target / "tables.json", text + "\n")
+    pictures = {name: (svg(wide), svg(narrow)) for name, (wide, narrow) in drawn.items()}
     write_text(target / "index.html", page(result, pictures))
 
 

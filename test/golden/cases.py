@@ -247,6 +247,7 @@ def _plans() -> list[Case]:
         Case(
             "plan_instrument",
             f"{kuka} --configurations 4 --starts 2 --instrument config/instruments/laser_tracker.yaml",
+            heavy=True,
         ),
         Case("plan_isotropic", f"{planar} --configurations 3 --instrument config/instruments/isotropic.yaml"),
         Case("plan_prior", f"{kuka} --configurations 3 --starts 3 --prior std.yaml"),
@@ -355,6 +356,7 @@ def _others() -> list[Case]:
             "campaign_simulated",
             f"{campaign} --simulate 1 --budget 20 --output c",
             ("c/measurements.csv", "c/validation.csv", "c/estimate.yaml"),
+            heavy=True,
         ),
         Case(
             "campaign_typical", f"{campaign} --simulate 1 --simulate-error-model typical --budget 12 --minimum 5"

@@ -302,7 +302,7 @@ def text_parameter(name: str, value: str) -> ParameterMessage:
     )
 
 
-@pytest.mark.parametrize("node", [PLANNER, IDENTIFIER, SIMULATOR])
+@pytest.mark.parametrize("node", repeats([IDENTIFIER], [PLANNER, IDENTIFIER, SIMULATOR]))
 def test_parameters(cell: Cell, node: str) -> None:
     numbers = ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[0.0] * BIG)
     nan = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float("nan"))
