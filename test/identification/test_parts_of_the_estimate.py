@@ -327,3 +327,12 @@ def test_accuracy_at_test_poses_by_its_parts() -> None:
         assert value == pytest.approx(values[name] + off)
     np.testing.assert_allclose(estimate.placement_values, estimate.fit.values, atol=1e-12)
     assert estimate.noise_source == "as given" and estimate.scale_spread == {}
+    for told_of, deviations in (
+        (estimate.residuals.before, np.zeros(4)),
+        (estimate.residuals.after, estimate.fit.deviations),
+        (estimate.residuals.placement_alone, estimate.fit.deviations),
+    ):
+        lengths = np.linalg.norm(points - robot.positions(q, deviations), axis=2)
+        assert told_of.mean == pytest.approx(lengths.mean(), rel=1e-6)
+        assert told_of.rms == pytest.approx(np.sqrt(np.mean(lengths**2)), rel=1e-6)
+        assert told_of.max == pytest.approx(lengths.max(), rel=1e-6)
