@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -306,7 +307,9 @@ def test_accuracy_at_test_poses_by_its_parts() -> None:
     points = robot.positions(q) + SIGMA * np.random.default_rng(0).standard_normal((12, 1, 3))
     data = Measurements(robot.joint_names, q, points)
     problem = IdentificationProblem(robot, data, SIGMA, ErrorModel.paper(SIGMA), test_poses=poses)
+    began = time.perf_counter()
     estimate = identify(problem)
+    assert 0.0 < estimate.seconds < time.perf_counter() - began
     told = estimate.accuracy
     rows = robot.jacobian(poses, estimate.fit.deviations)
     expected = np.sqrt(np.trace(rows @ estimate.fit.covariance @ np.swapaxes(rows, 1, 2), axis1=1, axis2=2))
