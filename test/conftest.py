@@ -1,6 +1,6 @@
 # Copyright 2026 calib_planner contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Makes ``robots`` and the tools importable from every test folder; the nodes' tests, which wait, come first.
+"""Makes ``robots`` and the tools importable from every test folder; and mixes tests that wait with others.
 
 What is imported and collected stays for the whole run: Python's collector of garbage does not look through it
 again and again, which took a twentieth of the processor time.
@@ -24,7 +24,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_threa
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LONG = ("test_docs.py", "test_golden.py", "test_robust.py", "test_campaign.py", "test_reproduction.py")
+LONG = (
+    *("test_docs.py", "test_golden.py", "test_robust.py", "test_campaign.py", "test_reproduction.py"),
+    *("test_campaign_node.py", "test_hostile_peer.py", "test_page_node.py", "test_campaign_goes_on.py"),
+)
 """Files of half a minute each: if one of them came last, one process would work on it while others are done."""
 
 
@@ -44,4 +47,10 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: (item.path.parent.name != "ros", item.path.name not in LONG))
+    """Files with nodes, which wait, evenly among the others, so that no core waits; the long ones first."""
+    paths = dict.fromkeys(item.path for item in items)
+    place: dict[Path, float] = {}
+    for nodes in (True, False):
+        some = sorted((p for p in paths if (p.parent.name == "ros") == nodes), key=lambda p: p.name not in LONG)
+        place |= {path: k / len(some) for k, path in enumerate(some)}
+    items.sort(key=lambda item: (place[item.path], item.path))
