@@ -440,6 +440,7 @@ def test_closed_forms_are_rounded_to_the_safe_side():
     ]
     for criterion, value in exact:
         assert value * (1 - 1e-11) < _scale(criterion, root) < value
+    assert _scale(Determinant(), root[:, :3]) == 1.0  # of a singular G: there is no closed form
     proof = Proof(0.25, 0.25, np.zeros(4), root @ root.T, 8.0, 1, (), 0.0, "proven")
     prior = np.diag([1.0, 2.0, 4.0, 8.0])  # tr G M₀ = 15
     for visits in (0, 4):
