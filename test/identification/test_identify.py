@@ -105,6 +105,7 @@ def test_unidentifiable_combinations_are_named_and_fixed():
     estimate = identify(problem)
     assert estimate.fit.status == "rank_deficient"
     assert set(estimate.observability.fixed) == {"d0", "q6", "q1"}
+    assert estimate.observability.rank == len(estimate.fit.parameters) - 3 == 7
     combinations = dict(zip(estimate.observability.fixed, estimate.observability.unidentifiable, strict=True))
     assert combinations["q6"] == "q6"
     assert combinations["d0"] == "1·d0 - 1·base.z"

@@ -98,6 +98,13 @@ def test_a_test_pose_is_blind_if_it_feels_what_no_point_shows() -> None:
         np.testing.assert_array_equal(_blind_poses(problem, robot, directions), expected)
         assert not expected[0]
     assert not _blind_poses(problem, robot, np.zeros((0, 3))).any()
+    # One configuration tells three of five; another, where no point was seen, tells nothing.
+    more = kuka("d1,q2,d2,q3,q5")
+    q = np.vstack([np.tile(q[0], (3, 1)), poses[1]])
+    told = Measurements(more.joint_names, q, np.concatenate([more.positions(q[:3]), np.full((1, 1, 3), np.nan)]))
+    problem = IdentificationProblem(more, told, SIGMA, ErrorModel.paper(), test_poses=poses)
+    directions = np.linalg.svd(more.jacobian(q[:1])[0])[2][3:]
+    assert _blind_poses(problem, more, directions).tolist() == [False, True, True]
 
 
 def test_variances_of_the_points_in_use() -> None:
@@ -199,7 +206,7 @@ def test_a_rejected_point_belongs_elsewhere_if_it_fits_there_as_others_fit_their
     q = random_configurations(robot, 8, 2)
     predicted = robot.positions(q)
     points, out = predicted + 1e-4, np.zeros((8, 1), bool)
-    points[3, 0], points[5, 0] = predicted[6, 0] + 2e-4, predicted[1, 0] + 6e-4
+    points[3, 0], points[5, 0] = predicted[6, 0] + 2e-4, predicted[1, 0] + 3.5e-4
     out[[3, 5]] = True
     problem = IdentificationProblem(
         robot, Measurements(robot.joint_names, q, points), SIGMA, ErrorModel.paper(3e-5)

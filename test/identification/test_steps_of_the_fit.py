@@ -463,12 +463,12 @@ def test_an_update_is_made_of_an_estimate_that_stands_and_for_data_that_are_much
 
 
 def test_a_visit_that_comes_behind_a_shifted_run_belongs_to_it() -> None:
-    """Visits 14 … 19 are shifted; of three new ones one comes first, one before the run and one behind it."""
+    """Visits 14 … 19 are shifted; of three new ones one comes first, one before the run and one within it."""
     run = np.arange(50) >= 14
     data = changed(measured(), 0.02 * run[:, None, None])
     start = fit_error_model(unknown(ur10e(1)), data.select(np.arange(20)), SMALL)
     np.testing.assert_array_equal(start.origin.shifted[:, 0] > 0.0, run[:20])
-    rows = np.r_[44, :5, 45, 5:20, 20]
+    rows = np.r_[44, :5, 45, 5:18, 20, 18:20]
     points, q = np.array(data.p[rows]), data.q[rows]
     points[[0, 6]] = measured().p[[44, 45]]
     start = replace(start, origin=replace(start.origin, surprise=1.5))  # as if others had been as large
