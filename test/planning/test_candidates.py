@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
 from math import comb
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from calib_planner.planning import Candidates, PlanProblem, Search, plan, plan_s
 from calib_planner.planning.bound import candidate_design
 from calib_planner.planning.criteria import Accuracy, Determinant, DiagonalDeterminant, Eliminating, PowerMean
 from calib_planner.planning.planner import value_of
-from calib_planner.planning.search import enumeration
+from calib_planner.planning.search import enumeration, exchange
 from calib_planner.planning.search.enumeration import best_of_all, choices_of, seconds
 from calib_planner.planning.search.exchange import ChoiceProblem, RunningDeterminant, choose, scaled_rows
 from calib_planner.tracker import Isotropic
@@ -351,3 +352,58 @@ def test_pool_that_sees_less_than_the_robot_could() -> None:
     assert found.quality.status == "ok"
     assert len(found.quality.unidentifiable) > 24  # a robot that moves has 24 combinations, this pool sees fewer
     assert "fixed at nominal" in found.quality.message
+
+
+@pytest.mark.parametrize(("name", "factor"), [("test_pose", 1.0), ("test_pose", 0.4), ("d", 1.0)])
+def test_an_exchange_of_what_shares_errors_is_worth_what_is_said(name: str, factor: float) -> None:
+    """log Ψ of the choice with another row in each place, and to first order what a further one adds."""
+    robot = Robot.load("kuka_kr270").with_targets([[0.1, 0.0, 0.2], [0.0, 0.1, 0.1]])
+    robot = robot.with_parameters("lengths+offsets")
+    q = random_configurations(robot, 9, 3)
+    asked = PlanProblem(robot, q[:1], 4, criterion=name, error_model=typical(Isotropic(3e-5)))
+    space = plan_space(asked)
+    info: Any = space.model.linearised(q)
+    prior = space.prior + 1e5 * np.eye(len(space.prior))
+    problem = ChoiceProblem(info.whitened, space.search_criterion(), prior, 4, together=info, factor=factor)
+    search, rows, new = exchange._Together(problem, info), np.array([1, 7, 4, 2]), np.array([0, 3, 5, 8])
+    for position, row in enumerate(rows):
+        search.shared.put(position, row)
+    chosen = exchange._Chosen(problem, search.shared, rows)
+    np.testing.assert_allclose(
+        chosen.matrix, exchange.information_of(problem, rows[None])[0], rtol=1e-9, atol=1e-3
+    )
+    for position in range(4):
+        others = np.array([np.where(np.arange(4) == position, row, rows) for row in new])
+        expected = exchange.log_values_of(problem, exchange.information_of(problem, others))
+        np.testing.assert_allclose(chosen.with_one_more(new, position), expected, rtol=1e-9)
+    if factor == 1.0:
+        more = exchange.information_of(problem, np.array([[*rows, row] for row in range(9) if row not in rows]))
+        gradient = problem.criterion.value_and_gradient(chosen.matrix[None])[1][0]
+        wanted = np.sum(gradient * (more - chosen.matrix), axis=(1, 2))
+        gains = search._gains(chosen, chosen.matrix, given=True)[[0, 3, 5, 6, 8]]
+        share = gains / wanted  # of an accuracy up to a factor, and without the smallest directions of its weight
+        np.testing.assert_allclose(share / share.mean(), 1.0, rtol=1e-6 if name == "d" else 5e-3)
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+@pytest.mark.parametrize("name", ["a", "e"])
+def test_candidates_are_ranked_by_what_they_add_to_first_order(name: str, repeat: bool) -> None:
+    """Row by row: tr(G R_jᵀR_j). What is chosen is not tried again unless it may be."""
+    problem = ChoiceProblem(pool(4, 40), CRITERIA[name], np.zeros((P, P)), 4, repeat)
+    search, rows = exchange._Shortlisted(problem), np.array([3, 11, 5, 20])
+    matrix = exchange.information_of(problem, rows[None])[0]
+    gradient = problem.criterion.value_and_gradient(matrix[None])[1][0]
+    wanted = np.array([np.trace(gradient @ r.T @ r) for r in problem.rows])
+    np.testing.assert_allclose(search._gains(matrix), wanted, rtol=1e-9)
+    if not repeat:
+        wanted[rows] = -np.inf
+    best = np.argsort(-wanted)[: exchange.SHORTLIST]
+    assert len(set(best.tolist()) ^ set(search._shortlist(matrix, rows).tolist())) <= 2  # ranked by a little more
+
+
+@pytest.mark.parametrize("k", [2, 3, 4])
+def test_many_determinants_at_once_are_those_of_each(k: int) -> None:
+    half = np.random.default_rng(k).normal(size=(20, k, k))
+    blocks = half @ np.swapaxes(half, 1, 2)
+    expected = [np.log(np.prod(1.0 + np.linalg.eigvalsh(block))) for block in blocks]
+    np.testing.assert_allclose(exchange.log_det_plus_identity(blocks.transpose(1, 2, 0)), expected, rtol=1e-12)
