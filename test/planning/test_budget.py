@@ -282,6 +282,18 @@ def test_the_best_number_is_found_of_what_rises_and_then_falls(peak, start):
         assert all(total >= max(done, 6) for done, total in told)
 
 
+@pytest.mark.parametrize("ways", [[[20, 30, 45]], [[20, 13, 9]], [[20, 13, 9], [20, 30, 45]]])
+def test_an_irregularity_does_not_end_the_search_for_a_number_and_a_clear_fall_does(ways):
+    """With 100 visits log Ψ may fall by 0.05, and by what two of them are worth, without saying anything."""
+    for fall, goes_on in ((0.065, True), (0.075, False)):
+        worth = {m: -fall for way in ways for m in way[1:2]} | {way[2]: 1.0 for way in ways} | {20: 0.0}
+        attempt = lambda m, worth=worth: SimpleNamespace(  # noqa: E731
+            merit=worth.get(m, -9.0), counts=np.full(20, 5), size=m
+        )
+        best, _ = budget._best_size(attempt, ways, lambda *done: None)
+        assert best.size == (ways[0][2] if goes_on else 20)
+
+
 def test_of_no_number_that_comes_to_something_there_is_none():
     """And where only the smaller ones do, they are found from a larger one."""
     ways = (budget._steps(20, 4), budget._steps(20, 60))

@@ -29,7 +29,7 @@ def test_a_swap_is_worth_what_is_said(name: str, targets: int) -> None:
     assert isinstance(space.model, ExtendedModel)
     criterion, model = space.search_criterion(), space.model
     q = random_configurations(robot, 12, 3)
-    swaps = Swaps.among(model.linearised(q), criterion, space.prior)
+    swaps = Swaps.among(model.linearised(q), criterion, space.prior, 1.0)
     others = np.array([2, 5, 7, 11])
     got = swaps.values(others, 3)
     assert np.isneginf(got[others]).all() and np.isfinite(got[3])
@@ -57,7 +57,7 @@ def test_candidates_that_are_tried_are_the_best_to_first_order() -> None:
     assert isinstance(space.model, ExtendedModel)
     criterion, model, others = space.search_criterion(), space.model, np.array([2, 5, 7, 11])
     q = random_configurations(robot, 30, 3)
-    swaps = Swaps.among(model.linearised(q), criterion, space.prior)
+    swaps = Swaps.among(model.linearised(q), criterion, space.prior, 1.0)
     below = model.totals(q[others], 4)[0]
     for now in (0, 3, 20):
         whole = model.totals(q[[*others, now]], 5)[0] + space.prior

@@ -61,9 +61,7 @@ class Swaps:
     covariance: FloatArray
 
     @staticmethod
-    def among(
-        candidates: LinearisedExtension, criterion: Criterion, prior: FloatArray, factor: float = 1.0
-    ) -> Swaps:
+    def among(candidates: LinearisedExtension, criterion: Criterion, prior: FloatArray, factor: float) -> Swaps:
         """All configurations of ``candidates``, in the model ``scaled`` by ``factor``."""
         count, columns = len(candidates.poses), candidates.jacobian * candidates.model.column_scales(factor)
         return Swaps(criterion, prior, columns, candidates.covariance(count, factor=factor)[0])
