@@ -203,3 +203,12 @@ def test_where_nothing_is_gained_nothing_moves() -> None:
     end = solve(robot, goals, start, low, high)
     np.testing.assert_allclose(end, [[np.pi / 2, 0.0, 0.7]], atol=1e-5)
     assert np.linalg.norm(residuals(robot, goals, end)) == pytest.approx(0.1, rel=1e-9)
+
+
+def test_joints_that_move_nothing_stay_where_they_are() -> None:
+    """A point on the axis of the only joint: there is nothing to solve for."""
+    robot = Robot("roll", (Element("Tx", 0.5), Element("Rx", joint=0)), (), ("roll",), np.array([[-1.0, 1.0]]))
+    robot = robot.with_targets([[0.0, 0.0, 0.0]])
+    goals = Goals(np.zeros(3), np.array([[0.5, 0.1, 0.0]]), None, LEVER)
+    start = np.array([[0.3]])
+    np.testing.assert_array_equal(solve(robot, goals, start, start - 1.0, start + 1.0), start)
