@@ -375,6 +375,9 @@ def test_random_plans_are_of_accuracies_only():
 def test_a_time_is_not_filled_with_candidates_twice():
     """Six candidates that may be measured once each: no plan has more, however much time there is."""
     candidates = Candidates(random_configurations(Robot.load("planar_2r"), 6, 3))
+    assert budget._largest_size(two_link(candidates=candidates), 3) == 6
+    again = Candidates(candidates.configurations, True)
+    assert budget._largest_size(two_link(candidates=again), 3) == budget.MOST_CONFIGURATIONS
     found = plan_for_time(two_link(candidates=candidates), Pace(np.full(2, 1.0)), 3600.0)
     assert max(len(p.configurations) for p in found.tried) <= 6
     rows = {tuple(q) for q in np.asarray(candidates.configurations)}
