@@ -211,6 +211,8 @@ def test_sizes_are_what_the_terms_move_the_targets_by() -> None:
         return float(np.sqrt(np.mean(np.sum(change**2, axis=2))))
 
     assert set(told) == {"placement", "gravity", "smooth", "short", "visits", "points"}
+    still = replace(truth, model=model.without("visits")).sizes(q)
+    assert still == {name: size for name, size in told.items() if name != "visits"}
     placed = replace(truth, robot=robot).positions(q)
     assert told["placement"] == pytest.approx(rms(points - placed), rel=1e-3)
     moved = Truth.draw(robot, model, np.random.default_rng(1), {robot.parameter_names[0]: 1e-3, "base.x": 2.0})
