@@ -177,6 +177,13 @@ def test_a_series_comes_on_top_of_what_the_joints_do(paper: bool, harmonics: int
     off = more.actual(q) - truth.actual(q)
     np.testing.assert_allclose(off, wanted, atol=1e-14)
     assert more.model.gravity == truth.model.gravity and more.model.values.get("smooth.length") == 1.0
+    if paper:  # what is true is known
+        assert [(s.name, s.value, s.median, s.known) for s in more.model.scales] == [
+            ("smooth.size", 1e-4, 1e-4, True),
+            ("smooth.length", 1.0, 1.0, True),
+        ]
+    else:
+        assert more.model.scales == truth.model.scales
 
 
 def test_other_targets_keep_the_rest() -> None:

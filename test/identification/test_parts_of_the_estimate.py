@@ -297,6 +297,17 @@ def test_probability_of_a_sum_of_squares() -> None:
     assert np.isnan(ChiSquare(2.0, 0).probability) and np.isnan(ChiSquare(np.nan, 7).probability)
 
 
+def test_the_rank_is_the_number_of_parameters_that_the_data_tell() -> None:
+    """The height of an unknown base is that of the pedestal."""
+    robot = Robot.load("kuka_kr270").with_parameters("d0,d2", ("base",))
+    q = random_configurations(robot, 8, 2)
+    problem = IdentificationProblem(
+        robot, Measurements(robot.joint_names, q, robot.positions(q)), SIGMA, ErrorModel.paper()
+    )
+    sight = identify(problem).observability
+    assert sight.rank == 7 and sight.fixed == ("d0",)
+
+
 def test_correlated_pairs_are_named_the_strongest_first() -> None:
     """Standard deviations 2, 1, 3 and a fixed parameter; beyond 0.95 in either direction."""
     unit = np.array([[1.0, 0.96, 0.2, 0.0], [0.96, 1.0, -0.97, 0.0], [0.2, -0.97, 1.0, 0.0], [0.0] * 4])
