@@ -68,6 +68,14 @@ def test_base_pose_round_trips_also_at_the_singularity(pitch):
     np.testing.assert_allclose(robot.positions(q), plain @ matrix.T + xyz, atol=1e-14)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.longdouble, np.int64])
+def test_numbers_of_any_kind_are_taken_as_doubles(kind):
+    robot, q = mixed(), np.array([[0, 1, -2, 1], [1, 0, 3, -1]], kind)
+    for found in (robot.positions(q), robot.jacobian(q), robot.posture(q).tip_rotation):
+        assert found.dtype == np.float64
+    np.testing.assert_array_equal(robot.positions(q), robot.positions(q.astype(np.float64)))
+
+
 def test_a_robot_never_changes():
     robot = Robot.load("kuka_kr270")
     with pytest.raises(dataclasses.FrozenInstanceError):
