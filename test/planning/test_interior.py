@@ -140,6 +140,8 @@ def test_steps_are_newtons_on_the_barrier(pressure, most):
     np.testing.assert_allclose(ended.x, np.tile(wanted, (5, 1)), rtol=1e-7)
     np.testing.assert_allclose(ended.value, 0.5 * np.sum((wanted - centre) ** 2), rtol=1e-6)
     assert count <= most
+    del settings["tolerance"]
+    assert counted(squares(centre, np.ones(4)), Planes(edges), start, **settings)[1] <= count  # 1e-7 by default
 
 
 def test_a_direction_solves_the_newton_equations():
