@@ -16,7 +16,7 @@ from fits import simulated, unknown, ur10e
 from robots import mixed, random_configurations
 from scipy.stats import f as f_distribution
 
-from calib_planner import Measurements, Robot
+from calib_planner import IdentificationProblem, Measurements, Robot, identify
 from calib_planner.arrays import FloatArray
 from calib_planner.error_model import ErrorModel, JointFunctions, Placement, Poses, Prior, joint_units, typical
 from calib_planner.identification import alternatives, fit_error_model
@@ -51,6 +51,7 @@ from calib_planner.identification.registration import tip_poses
 from calib_planner.robot import rotation
 
 SMALL = replace(typical(), joint_functions=JointFunctions(("smooth",), harmonics=4))
+PLACEMENT = replace(typical(), joint_functions=None, gravity=None)
 SIZES = {"gravity": 2e-3, "smooth.size": 3e-4, "repeatability": 5e-5, "shared": 3e-5}
 POSES = random_configurations(ur10e(), 5, 9) / 3.0
 
@@ -411,6 +412,21 @@ def test_gain_and_movement_of_an_alternative_are_those_of_the_fit_with_its_colum
     promised = fit.knowledge.accuracy(POSES).per_pose
     assert best.deviations == pytest.approx((lengths / promised).max(), rel=0.05)
     assert best.material == (best.deviations > 1.0)
+
+
+def test_identify_looks_for_alternatives_unless_an_estimate_is_brought_up_to_date() -> None:
+    robot = Robot.load("planar_2r")
+    q = random_configurations(robot, 16, 1) / 2.0
+    late = column(q, 1, q[:, 1] + 0.02 * (np.arange(16) >= 9))
+    points = robot.positions(late) + 2e-5 * np.random.default_rng(0).standard_normal((16, 1, 3))
+    problem = IdentificationProblem(robot, Measurements(robot.joint_names, q, points), error_model=PLACEMENT)
+    estimate = identify(problem)
+    (told,) = estimate.alternatives
+    assert told.row == 9 and told.code in ("joint_step", "reseat")  # of the last joint that is the same
+    again = identify(problem, estimate)
+    assert again.alternatives == () and again.fit.iterations <= 2 < estimate.fit.iterations
+    paper = identify(IdentificationProblem(robot, problem.data, 2e-5, ErrorModel.paper()))
+    assert paper.alternatives == ()
 
 
 def test_a_visit_on_the_wrong_side_of_a_step_is_no_witness_of_its_doubt() -> None:
