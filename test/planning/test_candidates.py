@@ -285,13 +285,13 @@ def test_choices_that_see_too_little_are_few_or_there_is_no_answer(monkeypatch: 
         assert best_of_all(problem, problem.criterion, lambda matrix: 0.0) is None
 
 
-@pytest.mark.parametrize("share", [0.5, 2.0])
+@pytest.mark.parametrize("share", [0.7, 1.5])
 def test_a_matrix_is_singular_by_its_correlations_whatever_the_units(share: float) -> None:
-    """[[1, c], [c, 1]] has the eigenvalues 1 − c and 1 + c."""
+    """[[1, c, 0], [c, 1, 0], [0, 0, 1]] has the eigenvalues 1 − c, 1 and 1 + c."""
     ratio = share * enumeration.REGULAR
     c = (1.0 - ratio) / (1.0 + ratio)
-    units = np.array([[1e-3, 1e3], [1.0, 1.0], [1e4, 7.0]])
-    matrices = np.array([[1.0, c], [c, 1.0]]) * units[:, :, None] * units[:, None, :]
+    units = np.array([[1e-3, 1e3, 1.0], [1.0, 1.0, 1.0], [1e4, 7.0, 1e-2]])
+    matrices = np.array([[1.0, c, 0.0], [c, 1.0, 0.0], [0.0, 0.0, 1.0]]) * units[:, :, None] * units[:, None, :]
     assert enumeration._singular(matrices).tolist() == [share < 1.0] * 3
 
 
