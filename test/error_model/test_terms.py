@@ -29,6 +29,7 @@ from calib_planner.error_model.gravity import LINKS, downwards
 from calib_planner.error_model.joint_functions import spectrum
 from calib_planner.error_model.placement import joint_zeros
 from calib_planner.error_model.poses import joint_units
+from calib_planner.error_model.typical import with_tolerances
 from calib_planner.errors import InputError, UnknownNameError
 from calib_planner.robot import Element
 from calib_planner.tracker import Isotropic, LaserTracker
@@ -340,3 +341,12 @@ def test_a_model_needs_its_scales_and_some_noise() -> None:
         slim.without("placement")
     with pytest.raises(UnknownNameError, match="tolerance"):
         Placement("tight")
+
+
+def test_tolerances_of_a_data_sheet_are_known_where_a_model_had_none() -> None:
+    robot = mixed().with_parameters("full", ("base", "tool"))
+    model = with_tolerances(ErrorModel.paper(3e-5))
+    assert model.placement.prior == "tolerance" and all(s.known for s in model.scales)
+    assert model.values == {"placement.length": 5e-4, "placement.angle": 1e-3}
+    np.testing.assert_array_equal(model.variances(robot), Placement().variances(robot, model.values))
+    assert with_tolerances(typical()) == typical() and with_tolerances(model) is model
