@@ -38,9 +38,9 @@ def test_a_plan_with_constraints_is_the_library_s_by_service_and_action(bench: B
     chosen = {"robot": "ur10e", "constraints": "cell.yaml", "constraints_folder": str(tmp_path), "settle": 1.0}
     bench.start(PlannerNode, **chosen)
     request = PlanRequest(test_poses=poses(POSE), configurations=7, seed=2)
-    answer = bench.call(
-        PlanCalibration, "calibration_planner/request_plan", PlanCalibration.Request(request=request)
-    )
+    asking = PlanCalibration.Request(request=request)
+    # Seconds of search; asked again meanwhile, the node would be busy.
+    answer = bench.call(PlanCalibration, "calibration_planner/request_plan", asking, 120.0)
     assert answer.status == PlanCalibration.Response.SUCCESS, answer.message
     model = shipped_model("ur10e", "lengths+offsets", "")
     settings = replace(PlannerParameters(), **chosen)
@@ -56,7 +56,7 @@ def test_a_plan_with_constraints_is_the_library_s_by_service_and_action(bench: B
     np.testing.assert_allclose(times[1::2], np.add(times[::2], settings.settle + settings.dwell), atol=2e-9)
     assert paths[0].header.stamp == Time() and paths[0].header.frame_id == "base_link"
     handle = bench.goal(bench.action(PlanAction, "calibration_planner/plan"), PlanAction.Goal(request=request))
-    result = bench.future(handle.get_result_async()).result
+    result = bench.future(handle.get_result_async(), 120.0).result
     assert result.status == PlanAction.Result.SUCCESS
     assert result.plan.configurations == answer.plan.configurations
 
