@@ -121,27 +121,30 @@ WRITERS = """
     from dataclasses import replace
     from stores import *
 
+    def tell(text):
+        os.write(1, f"{text}\\n".encode())  # a line at once, or none of it, whenever the process is killed
+
     def write():
         store = opened(sys.argv[1])
         found = store.current() or store.begin("p", None)
         state = {d.number: d.status for d in found.records}
-        print(os.getpid(), *(f"{n}:{s}" for n, s in state.items()), flush=True)
+        tell(" ".join([str(os.getpid()), *(f"{n}:{s}" for n, s in state.items())]))
         k = len(state)
         while True:
             k += 1
             d = decision(standstill(k))
             number = store.record(found.number, d)
-            print(f"{number}:accepted", flush=True)
+            tell(f"{number}:accepted")
             if k % 3 == 0:
                 store.decide(found.number, [replace(d, number=number).now("undone", "")])
-                print(f"{number}:undone", flush=True)
+                tell(f"{number}:undone")
 
     for _ in range(8):
         child = os.fork()
         if child == 0:
             write()
         os.waitpid(child, 0)
-        print("killed", flush=True)
+        tell("killed")
 """
 """Eight processes, one after the other, that write until somebody kills them; the imports are made once."""
 
