@@ -171,7 +171,7 @@ def test_inactive_it_says_so_and_activated_it_plans(bench: Bench) -> None:
     assert not list(node.get_parameters_by_prefix("none")) and node.state == "unconfigured"
     assert node.set_parameters([Parameter("robot", value="kuka_kr270")])[0].successful
     assert change(bench, Transition.TRANSITION_CONFIGURE) and change(bench, Transition.TRANSITION_ACTIVATE)
-    answer = bench.call(PlanCalibration, SERVICE, request(test_poses=KUKA_POSE))
+    answer = bench.call(PlanCalibration, SERVICE, request(test_poses=KUKA_POSE), 120.0)
     assert answer.plan.robot == "kuka_kr270"
 
 

@@ -14,6 +14,8 @@ formulas run.
 another, equally good way to the same end. The tool demands that each entry still is a mutant of its file.
 ``same_by_rule`` in ``formulas.py`` lists one frequent kind without an entry.
 
+Where an entry of the report says ``few_tests``, it was made with a few test files only; the page marks it.
+
 ``--sample`` draws that many of each file, with a seed; the share of a sample of n has a standard error of at
 most 0.5/√n. ``--write`` puts the figures of the report, all files together, into ``docs/proof.md``.
 """
@@ -242,7 +244,8 @@ def page(report: dict[str, Any]) -> str:
             of = here[file]
             numbers = [of["mutants"], of["tried"], len(of["listed"]), of["caught"]]
             together = [a + b for a, b in zip(together, numbers, strict=True)]
-            rows.append(row(f"`{file.removeprefix('calib_planner/')}`", numbers))
+            mark = " *" if of.get("few_tests") else ""
+            rows.append(row(f"`{file.removeprefix('calib_planner/')}`{mark}", numbers))
         if together[1]:
             rows.append(row(f"**{room}**", together))
     alive = [(f, m) for f in formula_files() if f in report for m in report[f]["survivors"]]
