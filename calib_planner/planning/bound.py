@@ -601,7 +601,7 @@ def candidate_design(
         promising = np.where(weights > 0, -np.inf, height)
         missing = np.argsort(-promising, kind="stable")[:8]
         share = np.zeros(len(rows))
-        share[missing[promising[missing] > np.min(top)]] = 1e-3 * cap
+        share[missing[promising[missing] >= np.min(top)]] = 1e-3 * cap
         weights = _capped(weights + share, cap)
     assert best is not None
     return replace(best, bound=max(best.bound, best.value))

@@ -25,7 +25,7 @@ from calib_planner.planning.bound import (
     maximise_sensitivity,
     raised,
 )
-from calib_planner.planning.criteria import Determinant
+from calib_planner.planning.criteria import Accuracy, Determinant
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace
 from calib_planner.planning.planner import _design_problem, psi_of
@@ -213,6 +213,25 @@ def test_rounds_end_where_the_bound_is_close(distinct: int | None) -> None:
     else:
         best = 6 * (4.0 / 27.0) ** (1.0 / 3.0)
         assert design.value <= best * (1 + 1e-9) and best <= design.bound * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("visits", "distinct"), [(4, None), (2, None), (2, 2)])
+def test_a_candidate_that_looked_useless_at_first_comes_back(visits: int, distinct: int | None) -> None:
+    """With M₀ = δ I the variance of x₁ + x₂ is least, 2 / (δ + m/2), with half at each of (1, 0) and (0, 1).
+
+    Copies of (u, v) let (1, 0) tell nothing of it by the first measure: u is such that (1, 0) M⁻¹ (1, 1) = 0.
+    """
+    copies, v, delta = 30, 0.2, 0.01
+    u = v + (1.0 + delta * (copies + 2) / visits) / (copies * v)
+    assert u + v < 1.0  # the copies are no better than the two
+    rows = np.array([[1.0, 0.0], [0.0, 1.0], *[[u, v]] * copies])[:, None]
+    prior = delta * np.eye(2)
+    first = prior + visits * np.einsum("nkp,nkq->pq", rows, rows) / len(rows)
+    assert abs(np.linalg.solve(first, np.ones(2))[0]) < 1e-9
+    design = candidate_design(rows, Accuracy(np.ones((2, 2))), prior, visits, distinct)
+    best = (delta + visits / 2) / 2
+    assert design.value <= best * (1 + 1e-9) and best <= design.bound * (1 + 1e-9)
+    assert design.value >= (1.0 - 2e-3) * design.bound
 
 
 # ── with a whole error model ─────────────────────────────────────────────────────────────────────────────

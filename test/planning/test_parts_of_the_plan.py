@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,12 +18,13 @@ from calib_planner import PlanProblem, Robot, plan
 from calib_planner.error_model import Prior, typical
 from calib_planner.planning import Candidates, Custom, Search, plan_space
 from calib_planner.planning.bound import ApproximateDesign
-from calib_planner.planning.information import PlanSpace
+from calib_planner.planning.information import PlanSpace, spread_spaces
 from calib_planner.planning.planner import (
     Progress,
     _Bound,
     _bound,
     _checked,
+    _criterion_of,
     _good_enough,
     _rest_idle_joints,
     _Rounded,
@@ -193,7 +195,7 @@ def test_progress_tells_what_the_plan_reaches(whole: bool) -> None:
     """Also where Ψ is less than one, and where the search is for the mean over several sizes of errors."""
     told: list[Progress] = []
     changes: dict[str, Any] = {"error_model": typical(Isotropic(3e-5))} if whole else {"configuration_sigma": 1.0}
-    problem = two_link(90.0, 2, **changes)
+    problem = two_link(90.0, 2, search=replace(PLAIN, starts=2), **changes)
     quality = plan(problem, lambda progress: told.append(progress)).quality
     assert whole or quality.predicted_accuracy == pytest.approx(np.sqrt(2.0), rel=1e-3)
     assert told[-1].best_accuracy == pytest.approx(quality.predicted_accuracy, rel=1e-6 if whole else 1e-3)
@@ -210,6 +212,52 @@ def test_a_plan_is_good_enough_within_its_share_of_the_bound() -> None:
     near = design_of(psi, q)
     assert not _good_enough(space, None, best) and not _good_enough(space, near, None)
     assert not _good_enough(plan_space(two_link(compound={"d": 0.5})), near, best)
+
+
+@pytest.mark.parametrize(("criterion", "share"), [("test_pose", 0.5), ("test_pose", 0.0), ("d", 0.5)])
+def test_of_few_choices_the_plan_is_the_best_with_its_share_and_the_bound_is_without(
+    criterion: str, share: float
+) -> None:
+    """Every choice of two of eight, ρ0 by (18) and det M = m² − S²."""
+    q, search = at(10.0, 30.0, 50.0, 70.0, 100.0, 130.0, 150.0, 170.0), Search(general_weight=share)
+    problem = two_link(40.0, 2, criterion=criterion, candidates=Candidates(q), search=search)
+    found = plan(problem)
+    space, choices = plan_space(problem), [q[list(rows)] for rows in combinations(range(8), 2)]
+
+    def both(rows: np.ndarray) -> float:
+        covariance = np.linalg.inv(space.model.totals(rows, 2)[0])
+        return (1 - share) * equation_18(rows, 40.0) + share * float(np.trace(space.general @ covariance))
+
+    if criterion == "d":
+        wanted = max(choices, key=lambda rows: 4.0 - np.cos(rows[:, 1]).sum() ** 2)
+        value = np.sqrt(4.0 - np.cos(wanted[:, 1]).sum() ** 2)
+    else:
+        wanted, value = min(choices, key=both), min(equation_18(rows, 40.0) for rows in choices) ** 0.5
+    assert sorted(map(tuple, found.configurations)) == sorted(map(tuple, wanted))
+    assert found.quality.value_bound == pytest.approx(value)
+    assert (found.quality.efficiency < 0.999) == (criterion == "test_pose" and share > 0)
+    assert (found.quality.bound, found.quality.bound_tolerance) == ("proven", 0.0)
+    assert ("a share for accuracy everywhere" in found.quality.message) == (
+        criterion == "test_pose" and share > 0
+    )
+    assert "choice of parameters" not in found.quality.message
+
+
+def test_the_search_for_other_sizes_of_the_errors_is_for_the_accuracies_of_those() -> None:
+    """One robot, whose joints err four times as much; a compound criterion is the same for all sizes."""
+    problem = two_link(
+        40.0, 3, "l1,l2,dq2", error_model=typical(Isotropic(3e-5)), search=Search(general_weight=0.3)
+    )
+    space, q = plan_space(problem), at(80.0, -80.0, 60.0)
+    other = spread_spaces(space)[1]
+    matrix = other.model.totals(q, 3)[0] + other.prior
+    inverse = np.linalg.inv(matrix)
+    tests = other.test_jacobians[0]
+    expected = 0.7 * np.trace(tests @ inverse @ tests.T) + 0.3 * np.trace(other.general @ inverse)
+    assert _criterion_of(other, space.search_criterion()).exact(matrix) == pytest.approx(1.0 / expected, rel=1e-9)
+    compound = plan_space(replace(problem, compound={"d": 0.5}))
+    marked = compound.criterion("d")
+    assert _criterion_of(compound, marked) is marked
 
 
 def whole_space(visits: int = 3) -> PlanSpace:
