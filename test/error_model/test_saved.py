@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -127,3 +128,5 @@ def test_a_prior_is_equal_to_its_like_only() -> None:
     prior = Prior(("d1",), [0.5], [1e-4])
     assert prior == Prior(("d1",), [0.5], [1e-4]) and hash(prior) == hash(Prior(("d1",), [0.5], [1e-4]))
     assert prior != Prior(("d1",), [0.5], [2e-4]) and prior != ("d1",) and prior is not None
+    for other in (replace(prior, names=("d2",)), replace(prior, source="other")):
+        assert prior != other and other != prior

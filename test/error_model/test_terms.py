@@ -22,6 +22,7 @@ from calib_planner.error_model import (
     Points,
     Poses,
     Prior,
+    Scale,
     Visits,
     typical,
 )
@@ -341,6 +342,45 @@ def test_a_model_needs_its_scales_and_some_noise() -> None:
         slim.without("placement")
     with pytest.raises(UnknownNameError, match="tolerance"):
         Placement("tight")
+
+
+def test_a_model_without_a_term_keeps_the_others() -> None:
+    model = typical(noise=Isotropic(1e-5))
+    names = ("placement", "gravity", "joint_functions", "visits", "points")
+    assert tuple(term.name for term in model.terms) == names and not model.points.estimate_scale
+    for term in ("gravity", "joint_functions", "visits"):
+        less = model.without(term)
+        assert [t for t in less.terms if t not in model.terms] == []
+        assert tuple(t.name for t in less.terms) == tuple(n for n in names if n != term)
+    for left, gone in (("smooth", "short"), ("short", "smooth")):
+        less = model.without(gone)
+        assert less.joint_functions is not None and less.joint_functions.components == (left,)
+        assert less.without(left) == model.without("joint_functions")
+        assert less.terms[:2] + less.terms[3:] == model.terms[:2] + model.terms[3:]
+    alone = model.placement_alone
+    assert tuple(t.name for t in alone.terms) == ("placement", "visits", "points")
+    kept = ("placement.length", "placement.angle", "repeatability", "shared", "floor")
+    assert tuple(alone.values) == kept
+
+
+def test_the_papers_model_is_placement_and_noise_and_a_stated_one_is_all_of_it() -> None:
+    assert ErrorModel.paper().is_papers and ErrorModel.paper(3e-5).is_papers
+    for kept in ("gravity", "joint_functions", "visits"):
+        model = typical()
+        for term in {"gravity", "joint_functions", "visits"} - {kept}:
+            model = model.without(term)
+        assert not model.is_papers and model.without(kept).is_papers
+    assert ErrorModel.paper().with_noise(3e-5) == ErrorModel.paper(3e-5)
+    told = typical(estimate_scale=True).with_noise(3e-5)
+    assert told.points == Points(Isotropic(3e-5), estimate_scale=True) and told.values["floor"] == 2e-5
+
+
+def test_sizes_are_more_than_zero_and_a_factor_is_one_or_more() -> None:
+    size = Scale("floor", 2e-5, 3e-5, 1.0, "m")
+    assert size.known and not replace(size, factor=1.5).known
+    for field, wrong in (("value", 0.0), ("value", -0.5), ("median", 0.0), ("median", -0.5), ("factor", 0.99)):
+        with pytest.raises(InputError, match=rf"floor\.{field}"):
+            replace(size, **{field: wrong})
 
 
 def test_tolerances_of_a_data_sheet_are_known_where_a_model_had_none() -> None:

@@ -144,6 +144,8 @@ def test_drawn_scales_have_their_spread() -> None:
     fixed = replace(model, scales=tuple(replace(s, factor=1.0, value=2.0 * s.median) for s in model.scales))
     assert fixed.with_drawn_scales(rng).values == fixed.values
     assert ErrorModel.paper().with_drawn_scales(rng) == ErrorModel.paper()
+    more = replace(fixed, scales=tuple(replace(s, factor=1e305) for s in fixed.scales))
+    assert more.with_drawn_scales(rng).values == fixed.values
 
 
 def test_the_papers_robot_is_its_geometry_and_noise() -> None:

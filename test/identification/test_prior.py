@@ -186,6 +186,8 @@ BROKEN = {
     "not symmetric": (("a", "b"), [0, 0], [[1, 0.5], [0.1, 1]], "positive definite"),
     "not positive": (("a", "b"), [0, 0], [[1, 2], [2, 1]], "positive definite"),
     "singular": (("a", "b"), [0, 0], [[1, 1], [1, 1]], "positive definite"),
+    "number": (("a",), [0], 1.0, "prior.covariance"),
+    "negative in covariance": (("a", "b"), [0, 0], [[-0.5, 0], [0, 1]], "positive definite"),
     "zero in covariance": (("a", "b"), [0, 0], [[0, 0], [0, 1]], "positive definite"),
     "not symmetric and small": (("a", "b"), [0, 0], [[1e-8, 4e-9], [3e-9, 1e-8]], "positive definite"),
     "singular and small": (("a", "b"), [0, 0], [[1e-10, 1e-10], [1e-10, 1e-10]], "positive definite"),
