@@ -23,6 +23,7 @@ from calib_planner.planning.bound import (
     continued,
     heights_of,
     maximise_sensitivity,
+    maximised,
     raised,
 )
 from calib_planner.planning.criteria import Accuracy, Determinant
@@ -150,6 +151,25 @@ def test_the_bound_is_what_is_known_and_each_visit_at_most_the_largest_height() 
         ground + 5 * top, rel=1e-6
     )
     assert raised(request, replace(design, bound=99.0), q[:3], np.random.default_rng(0)).bound == 99.0
+
+
+def test_a_thorough_maximisation_ends_when_two_batches_raise_nothing() -> None:
+    """From far too low a bound; what ends it earlier leaves the rise that was met last."""
+    space, gradient = two_link(visits=5), np.array([[0.9, -0.2], [-0.2, 0.4]])
+    request, q = request_of(space), random_configurations(space.robot, 3, 1)
+    low = replace(made(0.1, 1.0), gradient=gradient, seen=request.model, ground=0.0, support=q)
+    for most, missed in ((9, bound.MAY_MISS), (1, 5 * 1.7 - 1.0)):
+        calls: list[int] = []
+        design = maximised(
+            request,
+            low,
+            np.random.default_rng(0),
+            lambda calls=calls, most=most: calls.append(1) or len(calls) >= most,
+        )
+        assert design.bound == pytest.approx(5 * 1.7, rel=1e-6)
+        assert design.missed == pytest.approx(missed, rel=1e-6)
+        assert len(calls) == (most if most == 1 else 2)
+    assert maximised(replace(request, candidates=q), low, np.random.default_rng(0), lambda: False) is low
 
 
 def test_starts_are_the_heavy_places_and_high_random_ones() -> None:
