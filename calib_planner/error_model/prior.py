@@ -92,17 +92,13 @@ class Prior:
                 raise UnknownNameError("prior", name, list(names))
         return [list(names).index(name) for name in self.names]
 
-    def rows(self, names: Sequence[str], values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The prior as equations for parameters ``names`` (P) now at ``values`` (P,).
-
-        Returns:
-            (K, P) whitened rows and (K,) right-hand sides: rows · ΔΠ = right.
+    def rows(self, names: Sequence[str]) -> FloatArray:
+        """(K, P) L⁻¹ with a column for each of the P parameters ``names``: the whitened equations of the prior.
 
         Raises:
             UnknownNameError: The prior speaks of a parameter that is not among ``names``.
         """
         at = self.places(names)
-        inverse = solve_triangular(self.root, np.eye(len(at)), lower=True)
         rows = np.zeros((len(at), len(names)))
-        rows[:, at] = inverse
-        return rows, inverse @ (np.asarray(self.values) - values[at])
+        rows[:, at] = solve_triangular(self.root, np.eye(len(at)), lower=True)
+        return rows

@@ -388,7 +388,7 @@ def _stated_rows(problem: PlanProblem) -> FloatArray:
     variances = placement.variances(problem.robot, problem.model.values)
     rows: FloatArray = np.zeros((0, len(names)))
     if stated is not None:
-        rows, _ = stated.rows(names, np.zeros(len(names)))
+        rows = stated.rows(names)
         variances[stated.places(names)] = np.inf
     known = np.isfinite(variances)
     return np.concatenate([rows, np.diag(1.0 / np.sqrt(variances))[known]])

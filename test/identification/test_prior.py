@@ -211,9 +211,19 @@ def test_prior_of_another_robot_is_refused_with_the_names_there_are():
 
 def test_units_of_very_different_size_are_no_singular_covariance():
     prior = Prior(("a", "b"), [0, 0], [[1e-24, 0], [0, 1e6]])
-    rows, right = prior.rows(("b", "c", "a"), np.array([1e3, 7.0, 1e-12]))
-    np.testing.assert_allclose(rows, [[0, 0, 1e12], [1e-3, 0, 0]], rtol=1e-12)
-    np.testing.assert_allclose(right, [-1.0, -1.0], rtol=1e-12)
+    np.testing.assert_allclose(prior.rows(("b", "c", "a")), [[0, 0, 1e12], [1e-3, 0, 0]], rtol=1e-12)
+
+
+def test_rows_of_a_prior_are_its_normal_distribution():
+    """Equations of variance one, whose normal matrix tells the variance of one parameter given the other."""
+    covariance = np.array([[4e-6, 1.2e-7], [1.2e-7, 1e-8]])  # correlation 0.6
+    rows = Prior(("d1", "q2"), [0.5, 0.1], covariance).rows(("q2", "d3", "d1"))
+    np.testing.assert_allclose(rows[:, [2, 0]] @ covariance @ rows[:, [2, 0]].T, np.eye(2), atol=1e-12)
+    normal = rows.T @ rows
+    assert not normal[1].any() and not normal[:, 1].any()
+    assert 1.0 / normal[2, 2] == pytest.approx(4e-6 * (1.0 - 0.6**2))
+    assert 1.0 / normal[0, 0] == pytest.approx(1e-8 * (1.0 - 0.6**2))
+    assert normal[0, 2] < 0.0
 
 
 def test_typical_prior():
