@@ -151,9 +151,8 @@ class ErrorModel:
         A scale that is known stays, and so does one of which nothing is known.
         """
         drawn = rng.standard_normal(len(self.scales))
-        spread = {s.name: s.factor if s.factor < NOTHING_KNOWN else 1.0 for s in self.scales}
         values = {
-            s.name: s.median * spread[s.name] ** float(d) if spread[s.name] > 1.0 else s.value
+            s.name: s.median * s.factor ** float(d) if 1.0 < s.factor < NOTHING_KNOWN else s.value
             for s, d in zip(self.scales, drawn, strict=True)
         }
         return self.with_values(values)
