@@ -80,6 +80,17 @@ def test_weights_improve_to_the_best_measure(scale: float, exponent: float) -> N
     np.testing.assert_allclose(w[[0, 10, 20]], 1.0 / 3.0, atol=0.03)
 
 
+@pytest.mark.parametrize("exponent", [0.5, 1.0])
+def test_an_update_takes_each_weight_times_a_power_of_its_height(exponent: float) -> None:
+    """w_k ← w_k (d_k / mean)^e with d_k = tr(M⁻¹ I_k) for the determinant, which it raises for e ≤ 1."""
+    rows = np.linspace(-1.0, 1.0, 7)[:, None] ** np.arange(3)
+    unit, w = rows[:, :, None] * rows[:, None], np.array([1.0, 2.0, 1.0, 3.0, 1.0, 2.0, 4.0]) / 14
+    heights = np.einsum("ka,ab,kb->k", rows, np.linalg.inv(np.einsum("k,kij->ij", w, unit)), rows)
+    expected = w * heights**exponent
+    got, _ = bound._reweighted(Determinant(), unit, w, np.zeros((3, 3)), iterations=1, exponent=exponent)
+    np.testing.assert_allclose(got, expected / expected.sum(), rtol=1e-9)
+
+
 # ── measures ─────────────────────────────────────────────────────────────────────────────────────────
 
 

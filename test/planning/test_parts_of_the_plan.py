@@ -21,6 +21,7 @@ from calib_planner.planning.bound import ApproximateDesign
 from calib_planner.planning.information import PlanSpace, spread_spaces
 from calib_planner.planning.planner import (
     Progress,
+    _agreed,
     _Bound,
     _bound,
     _checked,
@@ -117,6 +118,7 @@ def test_nothing_is_said_of_whole_numbers_where_the_plan_is_blind() -> None:
     told = judged(two_link(criterion="d"), at(0.0, 0.0, 0.0), 1).quality
     assert (told.value, told.efficiency, told.status) == (0.0, 0.0, "singular")
     assert told.value_bound == pytest.approx(3.0, rel=1e-2)
+    assert told.bound == "proven" and 0.0 < told.bound_tolerance <= 1.1e-4
     assert "any number of configurations" not in told.message
 
 
@@ -202,6 +204,12 @@ def test_progress_tells_what_the_plan_reaches(whole: bool) -> None:
     assert told[-1].lower_bound == pytest.approx(quality.lower_bound, rel=1e-9)
     assert told[-1].starts_done == quality.starts
     assert ("Planned for a robot that errs by the error model 'typical'" in quality.message) == whole
+
+
+def test_two_parts_of_the_search_agree_where_their_best_values_do() -> None:
+    assert not _agreed([]) and not _agreed([20.0])
+    assert _agreed([20.0, 20.0001]) and _agreed([0.0, 21.0001, 7.0, 21.0])
+    assert not _agreed([20.0, 20.001]) and not _agreed([20.0, 20.0, 21.0]) and not _agreed([1e-3, -1e-3])
 
 
 def test_a_plan_is_good_enough_within_its_share_of_the_bound() -> None:
