@@ -136,6 +136,21 @@ def test_a_stated_prior_takes_its_parameter_from_the_scale_and_moves_its_mean() 
     np.testing.assert_allclose(stated.means(robot), np.where(np.arange(3) == at, 3e-4, 0.0), atol=1e-12)
 
 
+def test_the_precision_is_of_lengths_and_angles_and_of_what_is_stated() -> None:
+    """Sizes of no whole inverse, base flat, two parameters stated together."""
+    robot = Robot.load("kuka_kr270").with_targets(np.zeros((1, 3))).with_parameters("d1,d2,d3,q2", ("base",))
+    covariance = np.array([[4e-2, 1.2e-2], [1.2e-2, 1e-2]])  # determinant 2.56e-4
+    placed = Placement(stated=Prior(("q2", "d1"), [0.1, 0.5], covariance))
+    model = typical(placement=placed).placement_alone.with_values({"placement.length": 0.3})
+    names = robot.parameter_names
+    d1, d2, d3, q2 = (names.index(n) for n in ("d1", "d2", "d3", "q2"))
+    expected = np.zeros((len(names), len(names)))
+    expected[d2, d2] = expected[d3, d3] = 1.0 / 0.09
+    expected[q2, q2], expected[d1, d1] = 1e-2 / 2.56e-4, 4e-2 / 2.56e-4
+    expected[q2, d1] = expected[d1, q2] = -1.2e-2 / 2.56e-4
+    np.testing.assert_allclose(model.precision(robot), expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize("term", ["placement", "gravity", "joint_functions"])
 def test_slopes_of_priors_are_derivatives(term: str) -> None:
     robot, model, step = ROBOTS["kr270 full"](), typical(), 1e-6
