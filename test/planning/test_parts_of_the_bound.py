@@ -183,6 +183,15 @@ def test_a_thorough_maximisation_ends_when_two_batches_raise_nothing() -> None:
     assert maximised(replace(request, candidates=q), low, np.random.default_rng(0), lambda: False) is low
 
 
+def test_maxima_are_looked_for_from_the_highest_of_many_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a descent that stays where it starts: of thousands the highest is near the top."""
+    monkeypatch.setattr(bound, "descend", lambda f, start, *_, **__: Descent(start, f(start)[0], len(start)))
+    space, gradient = two_link(visits=5), np.array([[0.9, -0.2], [-0.2, 0.4]])
+    low = replace(made(0.1, 1.0), gradient=gradient, seen=space.model, ground=0.0, support=np.zeros((1, 2)))
+    design = maximised(request_of(space), low, np.random.default_rng(0), lambda: False)
+    assert 5 * 1.7 * (1 - 1e-4) <= design.bound <= 5 * 1.7 * (1 + 1e-9)
+
+
 def test_starts_are_the_heavy_places_and_high_random_ones() -> None:
     space = two_link()
     request, gradient = request_of(space), np.array([[0.9, -0.2], [-0.2, 0.4]])

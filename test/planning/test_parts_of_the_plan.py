@@ -25,6 +25,7 @@ from calib_planner.planning.planner import (
     _Bound,
     _bound,
     _checked,
+    _Clock,
     _criterion_of,
     _good_enough,
     _rest_idle_joints,
@@ -204,6 +205,12 @@ def test_progress_tells_what_the_plan_reaches(whole: bool) -> None:
     assert told[-1].lower_bound == pytest.approx(quality.lower_bound, rel=1e-9)
     assert told[-1].starts_done == quality.starts
     assert ("Planned for a robot that errs by the error model 'typical'" in quality.message) == whole
+
+
+def test_time_and_cancellation_each_end_the_work() -> None:
+    late = two_link(search=replace(PLAIN, time_limit=1e-9))
+    assert _Clock(late, 2, None).over() and _Clock(two_link(), 2, lambda progress: True).over()
+    assert not _Clock(two_link(), 2, None).over() and not _Clock(two_link(), 2, lambda progress: False).over()
 
 
 def test_two_parts_of_the_search_agree_where_their_best_values_do() -> None:
