@@ -8,6 +8,7 @@ again and again, which took a twentieth of the processor time.
 
 import gc
 import os
+import random
 import signal
 import sys
 import threading
@@ -46,9 +47,20 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="files, and tests in a file, in random order")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Files with nodes, which wait, evenly among the others, so that no core waits; the long ones first."""
-    paths = dict.fromkeys(item.path for item in items)
+    paths = list(dict.fromkeys(item.path for item in items))
+    seed = config.getoption("shuffle")
+    if seed is not None:
+        draw = random.Random(seed)
+        draw.shuffle(paths)
+        draw.shuffle(items)
+        items.sort(key=lambda item: paths.index(item.path))
+        return
     place: dict[Path, float] = {}
     for nodes in (True, False):
         some = sorted((p for p in paths if (p.parent.name == "ros") == nodes), key=lambda p: p.name not in LONG)
