@@ -93,7 +93,7 @@ if sys.platform == "linux" and platform.machine() == "x86_64":
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="1.0.0",
     description="Plans robot calibration measurements and identifies geometrical parameters",
     long_description=(Path(__file__).resolve().parent / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
