@@ -156,6 +156,13 @@ def test_plans_from_candidates(criterion: str) -> None:
         assert 0.5 < found.quality.efficiency <= 1.0
 
 
+def choice(robot: Robot, m: int, criterion: str, candidates: np.ndarray, repeat: bool) -> PlanProblem:
+    """``m`` of the candidates, for two test poses, by the criterion alone."""
+    poses, search = random_configurations(robot, 2, 8), Search(general_weight=0.0)
+    chosen = Candidates(candidates, repeat)
+    return PlanProblem(robot, poses, m, criterion=criterion, search=search, candidates=chosen)
+
+
 SMALL = [(c, m) for c in ("test_pose", "worst_pose", "d", "a", "e", "o4") for m in (3, 4)]
 
 
@@ -166,14 +173,7 @@ def test_of_few_choices_the_plan_is_the_best(criterion: str, m: int, repeat: boo
     robot, rng = Robot.load("kuka_kr270"), np.random.default_rng(m)
     candidates = random_configurations(robot, 7, int(rng.integers(1000)))
     candidates[5] = candidates[2]  # some choices leave parameters unseen
-    problem = PlanProblem(
-        robot,
-        random_configurations(robot, 2, 8),
-        m,
-        criterion=criterion,
-        search=Search(general_weight=0.0),
-        candidates=Candidates(candidates, repeat),
-    )
+    problem = choice(robot, m, criterion, candidates, repeat)
     found = plan(problem).quality
     every = combinations_with_replacement if repeat else combinations
     values = [value_of(problem, candidates[list(rows)]) for rows in every(range(7), m)]
@@ -193,14 +193,7 @@ def test_the_home_configuration_may_be_among_candidates(criterion: str, count: i
     candidates[-4:] = random_configurations(robot, 4, 2)
     assert (robot.jacobian(candidates[0])[0, :, 2] == 0.0).all()
     for repeat in (False, True):
-        asked = PlanProblem(
-            robot,
-            random_configurations(robot, 2, 8),
-            3,
-            criterion=criterion,
-            search=Search(general_weight=0.0),
-            candidates=Candidates(candidates, repeat),
-        )
+        asked = choice(robot, 3, criterion, candidates, repeat)
         found = plan(asked)
         assert found.quality.status == "ok" and np.isfinite(found.quality.value)
         best = [value_of(asked, candidates[list(rows)]) for rows in combinations(range(count - 5, count), 3)]
