@@ -64,6 +64,15 @@ class Import(NamedTuple):
     line: int
 
 
+class Contents(NamedTuple):
+    """What the tests ask of a file; the tree itself, of many thousand objects, is not kept."""
+
+    imports: tuple[Import, ...]  # wherever they stand, and texts that name a module of ours
+    offered: frozenset[str]  # names that another file can import from it
+    names: tuple[str, ...]  # given to functions, classes, arguments, variables and attributes
+    texts: tuple[str, ...]  # with a blank in them: what people read
+
+
 def module_of(path: Path) -> str:
     """The dotted name of a file of the package or of the paper."""
     base = PAPER if path.is_relative_to(PAPER) else PACKAGE
@@ -76,21 +85,45 @@ EVERY = FILES | PAPER_FILES
 PLACES = [*GROUND, *ROOMS, *FRONT, "paper"]
 
 
-@cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def imports(tree: ast.AST) -> Iterator[Import]:
-    """All imports, wherever they stand, and texts that name a module of ours."""
+def contents(text: str) -> Contents:
+    """Of a Python text."""
+    tree = ast.parse(text)
+    used, offered, names, texts = list[Import](), set[str](), list[str](), list[str]()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (Import(alias.name, "", node.lineno) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert not node.level, "imports are absolute"
-            yield from (Import(node.module or "", alias.name, node.lineno) for alias in node.names)
-        elif isinstance(node, ast.Constant) and node.value in EVERY and "." in str(node.value):
-            yield Import(node.value, "", node.lineno)
+        match node:
+            case ast.Import():
+                used += [Import(alias.name, "", node.lineno) for alias in node.names]
+                offered |= {alias.asname or alias.name for alias in node.names}
+            case ast.ImportFrom():
+                assert not node.level, "imports are absolute"
+                used += [Import(node.module or "", alias.name, node.lineno) for alias in node.names]
+                offered |= {alias.asname or alias.name for alias in node.names}
+            case ast.Constant(value=str(value)):
+                if "." in value and value in EVERY:
+                    used.append(Import(value, "", node.lineno))
+                if " " in value:
+                    texts.append(value)
+            case ast.FunctionDef() | ast.ClassDef():
+                names.append(node.name)
+            case ast.arg():
+                names.append(node.arg)
+            case ast.Name(ctx=ast.Store()):
+                names.append(node.id)
+            case ast.Attribute(ctx=ast.Store()):
+                names.append(node.attr)
+            case ast.ExceptHandler(name=str(name)):
+                names.append(name)
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            offered.add(node.name)
+        for target in getattr(node, "targets", [getattr(node, "target", None)]):
+            offered |= {target.id} if isinstance(target, ast.Name) else set()
+    return Contents(tuple(used), frozenset(offered), tuple(names), tuple(texts))
+
+
+@cache
+def contents_of(module: str) -> Contents:
+    return contents(EVERY[module].read_text(encoding="utf-8"))
 
 
 def room_of(module: str) -> str:
@@ -102,32 +135,20 @@ def place_of(module: str) -> str:
     return "paper" if module in PAPER_FILES else room_of(module)
 
 
-def files_of(place: str) -> list[tuple[str, Path]]:
-    return [(m, p) for m, p in EVERY.items() if place_of(m) == place]
-
-
-@cache
-def bound(module: str) -> frozenset[str]:
-    """Names that a door offers: what its ``__init__`` imports or defines."""
-    names = {n.asname or n.name for n in ast.walk(tree_of(EVERY[module])) if isinstance(n, ast.alias)}
-    for node in tree_of(EVERY[module]).body:
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            names.add(node.name)
-        for target in getattr(node, "targets", [getattr(node, "target", None)]):
-            names |= {target.id} if isinstance(target, ast.Name) else set()
-    return frozenset(names)
+def files_of(place: str) -> list[str]:
+    return [m for m in EVERY if place_of(m) == place]
 
 
 def target_of(used: Import) -> str:
     """The file that an import means: ``from room import file`` is the file unless the door has that name."""
     below = f"{used.module}.{used.name}"
-    is_file = below in EVERY and used.module in EVERY and used.name not in bound(used.module)
+    is_file = below in EVERY and used.module in EVERY and used.name not in contents_of(used.module).offered
     return below if is_file else used.module
 
 
-def ours(tree: ast.AST) -> list[tuple[str, Import]]:
+def ours(file: Contents) -> list[tuple[str, Import]]:
     """(file, import) of what is imported from the package."""
-    pairs = [(target_of(i), i) for i in imports(tree)]
+    pairs = [(target_of(i), i) for i in file.imports]
     return [(t, i) for t, i in pairs if t.split(".")[0] == "calib_planner"]
 
 
@@ -156,8 +177,8 @@ def allowed_in(place: str) -> set[str]:
 def test_direction_of_imports(place: str) -> None:
     wrong = [
         (module, i)
-        for module, path in files_of(place)
-        for t, i in ours(tree_of(path))
+        for module in files_of(place)
+        for t, i in ours(contents_of(module))
         if room_of(t) not in allowed_in(place) and (t, i.name) != ("calib_planner", "__version__")
     ]
     assert not wrong
@@ -167,19 +188,19 @@ def other_room(module: str, target: str) -> bool:
     return module not in FILES or room_of(module) != room_of(target)
 
 
-def not_by_the_door(module: str, tree: ast.AST) -> list[Import]:
+def not_by_the_door(module: str, file: Contents) -> list[Import]:
     """Imports from another room that reach past its door."""
-    found = [i for t, i in ours(tree) if other_room(module, t) and t.count(".") > 1]
+    found = [i for t, i in ours(file) if other_room(module, t) and t.count(".") > 1]
     return [i for i in found if not (room_of(i.module) in WITHOUT_A_DOOR and module not in FILES)]
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_rooms_are_entered_by_their_doors(place: str) -> None:
-    assert not [(m, i) for m, p in files_of(place) for i in not_by_the_door(m, tree_of(p))]
+    assert not [(m, i) for m in files_of(place) for i in not_by_the_door(m, contents_of(m))]
 
 
 def test_the_paper_is_used_by_its_command_only() -> None:
-    used = {(m, i.module) for m, p in FILES.items() for i in imports(tree_of(p)) if "_paper" in i.module}
+    used = {(m, i.module) for m in FILES for i in contents_of(m).imports if "_paper" in i.module}
     assert used == {("calib_planner.cli.main", "calib_planner_paper.reproduce")}
 
 
@@ -194,7 +215,7 @@ def examples_and_benches() -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize(("where", "text"), [pytest.param(*p, id=p[0]) for p in examples_and_benches()])
 def test_users_import_from_doors_only(where: str, text: str) -> None:
-    assert not not_by_the_door("", ast.parse(text)), where
+    assert not not_by_the_door("", contents(text)), where
 
 
 def test_the_python_page_shows_what_doors_offer() -> None:
@@ -206,7 +227,7 @@ def test_the_python_page_shows_what_doors_offer() -> None:
 
 def test_no_cycle_of_files() -> None:
     doors = {m for m, p in EVERY.items() if p.name == "__init__.py"}
-    graph = {m: {t for t, _ in ours(tree_of(p)) if t in EVERY and t != m} for m, p in EVERY.items()}
+    graph = {m: {t for t, _ in ours(contents_of(m)) if t in EVERY and t != m} for m in EVERY}
     assert sum(map(len, graph.values())) > 200 and len(doors) > 10
     try:
         TopologicalSorter(graph).prepare()
@@ -223,11 +244,11 @@ def late():
     from calib_planner.robot import chain, Robot
     import_module("calib_planner.cli.plan")
 """
-    seen = [t for t, _ in ours(ast.parse(text))]
+    seen = [t for t, _ in ours(contents(text))]
     chain = "calib_planner.robot.chain"
     assert seen == [chain, chain, "calib_planner.robot", "calib_planner.cli.plan"]
-    assert len(not_by_the_door("calib_planner.io.csv", ast.parse(text))) == 3
-    assert not not_by_the_door("calib_planner.io.csv", ast.parse("from calib_planner.planning import plan"))
+    assert len(not_by_the_door("calib_planner.io.csv", contents(text))) == 3
+    assert not not_by_the_door("calib_planner.io.csv", contents("from calib_planner.planning import plan"))
 
 
 # ── ROS ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -245,7 +266,7 @@ def is_ros(module: str) -> bool:
 
 
 def test_no_ros_outside_the_ros_room() -> None:
-    used = [(m, i) for m in OUTSIDE for i in imports(tree_of(EVERY[m]))]
+    used = [(m, i) for m in OUTSIDE for i in contents_of(m).imports]
     assert not [(m, i) for m, i in used if is_ros(i.module) or is_ros(f"{i.module}.{i.name}")]
 
 
@@ -253,13 +274,13 @@ def test_the_walk_sees_modules_and_knows_ros() -> None:
     assert len(OUTSIDE) > 30
     assert is_ros("rclpy.node") and is_ros("sensor_msgs.msg") and is_ros("calib_planner_msgs.srv")
     assert is_ros("calib_planner.ros.demo") and not is_ros("calib_planner.robot") and not is_ros("rosbags")
-    inside = {i.module for m, p in FILES.items() if room_of(m) == "ros" for i in imports(tree_of(p))}
+    inside = {i.module for m in FILES if room_of(m) == "ros" for i in contents_of(m).imports}
     assert "rclpy" in inside and "calib_planner_msgs.srv" in inside
 
 
-@pytest.mark.parametrize("name", ["session.py", "execution.py"])
+@pytest.mark.parametrize("name", ["session", "execution"])
 def test_pure_parts_of_the_ros_room_are_pure(name: str) -> None:
-    used = [i.module for i in imports(tree_of(PACKAGE / "ros" / name))]
+    used = [i.module for i in contents_of(f"calib_planner.ros.{name}").imports]
     assert used and not [m for m in used if not m.startswith("calib_planner.ros") and is_ros(m)]
 
 
@@ -313,23 +334,8 @@ ALLOWED_NAMES = {
 ALLOWED_TEXT = re.compile(r"ThreadPool|ProcessPool|threadpool|held.out|hand on the stop", re.IGNORECASE)
 
 
-def names_defined(tree: ast.AST) -> Iterator[str]:
-    """Names that a file gives to functions, classes, arguments, variables and attributes."""
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            yield node.name
-        elif isinstance(node, ast.arg):
-            yield node.arg
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            yield node.id
-        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-            yield node.attr
-        elif isinstance(node, ast.ExceptHandler) and node.name:
-            yield node.name
-
-
-def old_names(tree: ast.AST) -> list[str]:
-    names = (n for n in names_defined(tree) if n.strip("_") not in ALLOWED_NAMES)
+def old_names(file: Contents) -> list[str]:
+    names = (n for n in file.names if n.strip("_") not in ALLOWED_NAMES)
     return [
         n for n in names if OLD_NAMES.keys() & set(re.findall("[a-z]+", re.sub("([A-Z])", r"_\1", n).lower()))
     ]
@@ -344,10 +350,8 @@ def old_words(text: str) -> list[str]:
 
 def texts_by_place() -> Iterator[tuple[str, str]]:
     """(room or folder, text) of all that people read: texts with a blank in them, pages, comments of messages."""
-    for module, path in EVERY.items():
-        for node in ast.walk(tree_of(path)):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
-                yield place_of(module), node.value
+    for module in EVERY:
+        yield from ((place_of(module), text) for text in contents_of(module).texts)
     folders = {
         "docs": "*.md",
         "msg_defs": "*.*",
@@ -368,7 +372,7 @@ WITH_WORDS = [*PLACES, "docs", "msg_defs", "config"]
 
 @pytest.mark.parametrize("place", WITH_WORDS)
 def test_no_name_is_made_of_old_words(place: str) -> None:
-    left = [f"{m}: {n}" for m, p in files_of(place) for n in old_names(tree_of(p))]
+    left = [f"{m}: {n}" for m in files_of(place) for n in old_names(contents_of(m))]
     assert not left
 
 
@@ -386,8 +390,8 @@ def test_no_text_speaks_in_old_words(place: str, words: dict[str, Counter[str]])
 
 
 def test_the_words_are_seen_where_they_are() -> None:
-    tree = ast.parse("class PoolProblem: pass\ndef worth_of(asked, held_out): self.slope = found = 1")
-    assert sorted(old_names(tree)) == ["PoolProblem", "asked", "found", "slope", "worth_of"]
+    text = "class PoolProblem: pass\ndef worth_of(asked, held_out): self.slope = found = 1"
+    assert sorted(old_names(contents(text))) == ["PoolProblem", "asked", "found", "slope", "worth_of"]
     assert old_words("The pool's slope; not found. Found: 3. Stop 2 of 5, hand on the stop. ThreadPool") == [
         "pool",
         "slope",
