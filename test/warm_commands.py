@@ -11,6 +11,7 @@ is a process of its own, as a user starts it.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
@@ -77,6 +78,7 @@ def serve(address: str) -> None:
     """Fork for every caller at the socket."""
     for name in MODULES:
         importlib.import_module(name)
+    gc.freeze()  # what is imported stays
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(address)
         listening.listen()
