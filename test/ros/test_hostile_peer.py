@@ -354,10 +354,18 @@ def test_a_plan_is_measured_and_saved_whatever_its_name(cell: Cell, planned: Pla
     cell.plans.publish(message)
     cell.bench.wait(lambda: cell.estimates[-1].plan_id == plan_id)
     client, known = cell.bench.action(ExecutePlan, f"{SIMULATOR}/execute_plan"), len(cell.measurements)
-    goal = cell.bench.goal(client, ExecutePlan.Goal(plan=message))
-    assert cell.bench.future(goal.get_result_async()).result.status == ExecutePlan.Result.SUCCESS
-    accepted = lambda: [m for m in cell.measurements[known:] if m.status == Measurement.ACCEPTED]  # noqa: E731
-    cell.bench.wait(lambda: len(accepted()) >= 4)
+
+    def accepted() -> set[int]:
+        return {m.configuration_index for m in cell.measurements[known:] if m.status == Measurement.ACCEPTED}
+
+    for again in range(5):  # a busy machine misses a standstill now and then
+        goal = cell.bench.goal(client, ExecutePlan.Goal(plan=message))
+        assert cell.bench.future(goal.get_result_async()).result.status == ExecutePlan.Result.SUCCESS
+        try:
+            cell.bench.wait(lambda: len(accepted()) >= 4, 5.0)
+            break
+        except AssertionError:
+            assert again < 4
     for name in ("save", "report"):
         answer = cell.bench.call(Trigger, f"{IDENTIFIER}/{name}", Trigger.Request(), 60.0)
         assert answer.success, answer.message
