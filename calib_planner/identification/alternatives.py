@@ -384,7 +384,9 @@ class _WidenedProblem(LinearProblem):
 def _widened(problem: LinearProblem, columns: FloatArray) -> _WidenedProblem:
     """``problem`` with flat ``columns`` (N, m, d) more."""
     both = np.concatenate([problem.columns, columns * problem.seen[:, :, None]], axis=2)
-    return _WidenedProblem(problem.robot, problem.model, problem.y, both, problem.parts, problem.seen)
+    return _WidenedProblem(
+        problem.robot, problem.model, problem.y, both, problem.parts, problem.seen, problem.poses
+    )
 
 
 def find_alternatives(

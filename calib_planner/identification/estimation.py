@@ -107,6 +107,8 @@ CHORDS = 8
 """Most steps of an update with the columns as they are; then all visits are linearised anew."""
 BENDS = 3e-2
 """Share of a point's standard deviation that kinematics and linearisation may differ by: it is not seen."""
+ROUNDING = 1e-6
+"""Left-out scores that differ by less are the same but for rounding, as of gravity along all axes."""
 OPTIONAL = ("short", "smooth", "gravity")
 """Terms that go if the left-out score is surely worse with them."""
 
@@ -226,7 +228,7 @@ class _Work:
         parts = {n: p * both for n, p in parts.items()}
         beyond = state.coefficients[random] - state.model.means(self.robot)[random]
         y = apart + columns[:, :, random] @ beyond
-        return LinearProblem(self.robot, state.model, y, columns, parts, seen)
+        return LinearProblem(self.robot, state.model, y, columns, parts, seen, poses)
 
     def accept(self, solution: Solution) -> bool:
         """Go to the solution; whether the predictions stood still."""
@@ -381,7 +383,7 @@ class _Work:
             differences = {t: scores - left_out(trial, self.groups).scores for t, trial in trials.items()}
             gains |= {t: float(d.sum()) for t, d in differences.items()}
             surely = {t: float(d.sum() + np.sqrt(len(d)) * d.std()) for t, d in differences.items()}
-            if not surely or min(surely.values()) > 0.0:
+            if not surely or min(surely.values()) > -ROUNDING:
                 return solution, gains
             worst = min(surely, key=lambda t: surely[t])
             before = self.state

@@ -30,6 +30,14 @@ has the blocks R_i⁻¹ of those that came, −R_i⁻¹ of those that went and t
 
 and the blocks of P follow from W_i A'⁻¹ W_iᵀ, for the price of a few products with a vector (``exchange``).
 
+Most columns are those of the joint functions, and these are products: b_lh(i) = c_l(i) w_lh(i), the lever (m,) of
+joint l at visit i times a wave. With the Gram matrices K_l = w_l Λ_l w_lᵀ (N, N) of its waves
+
+    (B Λ Bᵀ)_ij = Σ_l c_l(i) K_l(i, j) c_l(j)ᵀ ,                                                              (5)
+    b_lhᵀ P b_lh = w_lhᵀ Q_l w_lh ,     Q_l(i, j) = c_l(i)ᵀ P_ij c_l(j) ,
+
+so that the dense form needs up to m² times fewer operations for them.
+
 The scales are the maximum of L times their log-normal priors (``maximise``), by Newton steps with the average
 information f_aᵀ P f_b, f_a = ∂_a V P y (Gilmour, Thompson & Cullis 1995), in the logarithms of the scales.
 """
@@ -45,7 +53,7 @@ from scipy.linalg.blas import dgemm, dsyrk
 from scipy.linalg.lapack import dpotri, dtrtri
 
 from calib_planner.arrays import FloatArray, IntArray
-from calib_planner.error_model import ErrorModel
+from calib_planner.error_model import ErrorModel, Poses
 from calib_planner.robot import Robot
 
 RANK = 1e-7
@@ -58,6 +66,9 @@ UNBOUNDED = 1e9
 """The same where nothing is known of a scale; a factor from which on this is so."""
 ROUNDED_OFF = 1e-9
 """Share of the information in a direction below which what is left of it is rounding."""
+MANY = 150
+"""Coordinates from which (5) is used. For fewer it saves little, and another order of the sums would change the
+last digits of every answer."""
 SETTLED = 0.02
 """A step that promises less than this of −2 log L ends the search."""
 
@@ -73,6 +84,7 @@ class LinearProblem:
         columns: (N, m, coefficients) J⁺, zero rows where not measured.
         parts: Scale → (N, m, m) its part of R_i, zero rows and columns where not measured [m²].
         seen: (N, m) 1 where measured.
+        poses: Where the columns were taken, which tells the products of (5); ``None``: at several places.
     """
 
     robot: Robot
@@ -81,16 +93,22 @@ class LinearProblem:
     columns: FloatArray
     parts: Mapping[str, FloatArray]
     seen: FloatArray
+    poses: Poses | None = None
+
+    @cached_property
+    def variances(self) -> FloatArray:
+        """(model's coefficients,) prior variances, infinite where there is no prior."""
+        return self.model.variances(self.robot)
 
     @cached_property
     def flat(self) -> IntArray:
         """Numbers of the coefficients without a prior."""
-        return np.flatnonzero(np.isinf(self.model.variances(self.robot)))
+        return np.flatnonzero(np.isinf(self.variances))
 
     @cached_property
     def random(self) -> IntArray:
         """Numbers of the coefficients with one."""
-        return np.flatnonzero(np.isfinite(self.model.variances(self.robot)))
+        return np.flatnonzero(np.isfinite(self.variances))
 
     @cached_property
     def basis(self) -> FloatArray:
@@ -118,7 +136,7 @@ class LinearProblem:
     @cached_property
     def root(self) -> FloatArray:
         """(K,) Λ^½; of parameters with a stated prior the roots of its variances."""
-        return np.sqrt(self.model.variances(self.robot)[self.random])
+        return np.sqrt(self.variances[self.random])
 
     @cached_property
     def means(self) -> FloatArray:
@@ -155,12 +173,82 @@ class LinearProblem:
         return self.scaled(self.random_columns)
 
     def scaled(self, columns: FloatArray) -> FloatArray:
-        """Columns (…, K) of B, times Λ^½."""
-        result = columns * self.root
+        """Columns (…, K) of B, or the first of them, times Λ^½."""
+        result = columns * self.root[: columns.shape[-1]]
         if self.stated is not None:
             places, root = self.stated
             result[..., places] = columns[..., places] @ root
         return result
+
+    @cached_property
+    def products(self) -> tuple[FloatArray, FloatArray] | None:
+        """c (N, m, joints) and w (joints, N, 2·harmonics) of the last columns of B, those that are products."""
+        functions = self.model.joint_functions
+        if functions is None or self.poses is None or self.y.size < MANY:
+            return None
+        waves = functions.waves(self.poses).transpose(1, 0, 2)
+        return self.poses.levers * self.seen[:, :, None], np.ascontiguousarray(waves)
+
+    @cached_property
+    def plain_columns(self) -> FloatArray:
+        """(N·m, K or fewer) the first columns of B, those that are no products."""
+        count = len(self.random) - (0 if self.products is None else self.products[1][:, 0].size)
+        return self.columns[:, :, self.random[:count]].reshape(self.y.size, count)
+
+    @cached_property
+    def scaled_plain(self) -> FloatArray:
+        """(N·m, K or fewer) the same times Λ^½."""
+        return self.scaled_columns if self.products is None else self.scaled(self.plain_columns)
+
+    def _product_roots(self) -> FloatArray:
+        """(joints, 2·harmonics) Λ^½ of the columns that are products."""
+        assert self.products is not None
+        return self.root[self.plain_columns.shape[1] :].reshape(len(self.products[1]), -1)
+
+    def systematic_covariance(self) -> FloatArray:
+        """(N·m, N·m) B Λ Bᵀ [m²], by (5)."""
+        plain, (n, m) = self.scaled_plain, self.y.shape
+        result = np.asarray(plain @ plain.T)
+        if self.products is not None:
+            levers, waves = self.products
+            waves = waves * self._product_roots()[:, None]
+            gram = (waves @ waves.transpose(0, 2, 1)).transpose(1, 0, 2)  # j, l, i
+            wide = gram[..., None] * np.ascontiguousarray(levers.transpose(2, 0, 1))  # K_l(j, i) c_l(i)
+            result += (levers @ wide.reshape(n, -1, n * m)).reshape(n * m, n * m)
+        return result
+
+    def squares(self, projection: FloatArray) -> FloatArray:
+        """(K,) λ_k b_kᵀ P b_k for P = ``projection`` (N·m, N·m), by (5)."""
+        plain, (n, m) = self.scaled_plain, self.y.shape
+        result = np.einsum("ak,ak->k", plain, projection @ plain)
+        if self.products is None:
+            return np.asarray(result)
+        levers, waves = self.products
+        carried = (levers.transpose(0, 2, 1) @ projection.reshape(n, m, n * m)).reshape(n, -1, n, m)
+        inner = np.einsum("jlia,ial->lji", carried, levers)
+        own = np.einsum("lih,lih->lh", inner @ waves, waves) * self._product_roots() ** 2
+        return np.concatenate([result, own.ravel()])
+
+    def scaled_times(self, standard: FloatArray) -> FloatArray:
+        """B Λ^½ · standard, (K, n) → (N·m, n)."""
+        count, (n, m) = self.scaled_plain.shape[1], self.y.shape
+        result = np.ascontiguousarray((standard[:count].T @ self.scaled_plain.T).T)
+        if self.products is not None:
+            levers, waves = self.products
+            roots = self._product_roots()
+            turned = waves @ (roots[..., None] * standard[count:].reshape(*roots.shape, -1))
+            result += (levers @ turned.transpose(1, 0, 2)).reshape(n * m, -1)
+        return result
+
+    def pulled(self, vectors: FloatArray) -> FloatArray:
+        """(B Λ^½)ᵀ · vectors, (N·m, n) → (K, n)."""
+        plain, (n, m) = self.scaled_plain.T @ vectors, self.y.shape
+        if self.products is None:
+            return np.asarray(plain)
+        levers, waves = self.products
+        felt = levers.transpose(0, 2, 1) @ vectors.reshape(n, m, -1)
+        own = waves.transpose(0, 2, 1) @ felt.transpose(1, 0, 2) * self._product_roots()[..., None]
+        return np.concatenate([plain, own.reshape(-1, vectors.shape[1])])
 
     @cached_property
     def ratios(self) -> dict[str, FloatArray]:
@@ -205,8 +293,10 @@ class LinearProblem:
         new, old = model.values, self.model.values
         parts = {n: p * (new[n] / old[n]) ** 2 if n in new else p for n, p in self.parts.items()}
         result = replace(self, model=model, parts=parts)
-        for name in ("flat", "random", "basis", "flat_columns", "random_columns"):
+        for name in ("flat", "random", "basis", "flat_columns", "products", "plain_columns"):
             result.__dict__[name] = getattr(self, name)
+        if "random_columns" in self.__dict__:
+            result.__dict__["random_columns"] = self.random_columns
         return result
 
 
@@ -273,8 +363,7 @@ class DenseSolution(Solution):
 
     @cached_property
     def squares(self) -> FloatArray:
-        scaled = self.problem.scaled_columns
-        return np.asarray(np.einsum("ak,ak->k", scaled, self.projection @ scaled))
+        return self.problem.squares(self.projection)
 
     @cached_property
     def blocks(self) -> FloatArray:
@@ -290,7 +379,7 @@ class DenseSolution(Solution):
 
     def _reduced(self, vectors: FloatArray) -> FloatArray:
         flat = self.spread @ (self.carried.T @ vectors)
-        return np.vstack([flat, self.problem.scaled_columns.T @ (self.projection @ vectors)])
+        return np.vstack([flat, self.problem.pulled(self.projection @ vectors)])
 
     def _reduced_covariance(self) -> FloatArray:
         """From the singular values s of the whitened columns that F does not explain: 1/(1 + s²) along each.
@@ -414,9 +503,8 @@ def solve(problem: LinearProblem) -> Solution:
 def dense(problem: LinearProblem) -> DenseSolution:
     """By factorising V, (1)."""
     n, m = problem.y.shape
-    y, flat, scaled = problem.y.ravel(), problem.flat_columns, problem.scaled_columns
-    every = np.arange(n)
-    total = scaled @ scaled.T
+    y, flat, every = problem.y.ravel(), problem.flat_columns, np.arange(n)
+    total = problem.systematic_covariance()
     total.reshape(n, m, n, m)[every, :, every, :] += problem.covariance
     factor = np.asarray(np.linalg.cholesky(total), np.float64)
     inverse = _inverse_of(factor)
@@ -426,7 +514,7 @@ def dense(problem: LinearProblem) -> DenseSolution:
     projection = inverse - carried @ spread @ carried.T
     pulled = projection @ y
     value = 2.0 * np.log(np.diag(factor)).sum() + np.linalg.slogdet(normal)[1] + y @ pulled
-    pulls = scaled.T @ pulled
+    pulls = problem.pulled(pulled[:, None])[:, 0]
     return DenseSolution(
         problem,
         float(value),
@@ -693,7 +781,7 @@ def _pushes(solution: Solution, names: tuple[str, ...]) -> FloatArray:
     """(N·m, scales) ∂V P y by the logarithm of each scale."""
     problem, nothing = solution.problem, np.zeros(len(solution.pulls))
     ratios = np.stack([problem.ratios.get(n, nothing) for n in names])
-    pushes = np.ascontiguousarray(((ratios * solution.pulls) @ problem.scaled_columns.T).T)
+    pushes = problem.scaled_times((ratios * solution.pulls).T)
     for at, name in enumerate(names):
         if name in problem.parts:
             pushes[:, at] += 2.0 * (problem.parts[name] @ solution.weighted[:, :, None]).ravel()

@@ -13,6 +13,7 @@ from fits import problem_of, simulated, total_covariance, unknown, ur10e
 from robots import random_configurations
 
 from calib_planner.error_model import ErrorModel, Placement, typical
+from calib_planner.identification import likelihood
 from calib_planner.identification.doubt import part_of
 from calib_planner.identification.estimation import _Work, fit_error_model
 from calib_planner.identification.left_out import left_out
@@ -61,6 +62,28 @@ def test_both_forms_agree(problem: LinearProblem) -> None:
     ]
     for a, b in pairs:
         np.testing.assert_allclose(a, b, atol=2e-6 * np.abs(a).max())
+
+
+def test_products_of_levers_and_waves_are_the_columns(
+    problem: LinearProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """(5) against the columns written out."""
+    monkeypatch.setattr(likelihood, "MANY", 1)
+    assert problem.products is not None and problem.plain_columns.shape[1] < len(problem.random)
+    scaled, size = problem.scaled_columns, problem.y.size
+    rng = np.random.default_rng(3)
+    root, standard, rows = (rng.standard_normal((size, n)) for n in (size, len(problem.random), 2))
+    pairs = [
+        (problem.systematic_covariance(), scaled @ scaled.T),
+        (problem.squares(root @ root.T), np.sum((root.T @ scaled) ** 2, axis=0)),
+        (problem.scaled_times(standard.T), scaled @ standard.T),
+        (problem.pulled(rows), scaled.T @ rows),
+    ]
+    for a, b in pairs:
+        np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(b).max())
+    written_out = replace(problem, poses=None)
+    assert written_out.products is None
+    assert dense(problem).value == pytest.approx(dense(written_out).value, rel=1e-8)
 
 
 @pytest.mark.parametrize("form", [dense, by_coefficients])
@@ -212,7 +235,8 @@ def test_visits_that_come_go_and_lose_weight_are_the_same_as_solving_anew(target
     def part(rows: np.ndarray, doubt: np.ndarray | None) -> LinearProblem:
         parts = {n: p[rows] for n, p in whole.parts.items()}
         parts |= {} if doubt is None else {"doubt": part_of(doubt)}
-        return replace(whole, y=whole.y[rows], columns=whole.columns[rows], parts=parts, seen=whole.seen[rows])
+        columns, seen = whole.columns[rows], whole.seen[rows]
+        return replace(whole, y=whole.y[rows], columns=columns, parts=parts, seen=seen, poses=None)
 
     start = updatable(dense(part(some, None)))
     changed = exchange(start, part(chosen, doubt), np.where(chosen < 14, chosen, -1))
@@ -250,7 +274,12 @@ def test_a_visit_that_alone_tells_a_direction_cannot_be_taken_away() -> None:
     rows = np.arange(2)
     parts = {n: p[rows] for n, p in problem.parts.items()}
     less = replace(
-        problem, y=problem.y[rows], columns=problem.columns[rows], parts=parts, seen=problem.seen[rows]
+        problem,
+        y=problem.y[rows],
+        columns=problem.columns[rows],
+        parts=parts,
+        seen=problem.seen[rows],
+        poses=None,
     )
     with pytest.raises(np.linalg.LinAlgError):
         exchange(start, less, rows)
@@ -272,7 +301,12 @@ def test_left_out_residuals_are_those_of_a_refit_without_the_group(
         rest = np.flatnonzero(groups != group)
         parts = {n: p[rest] for n, p in problem.parts.items()}
         part = replace(
-            problem, y=problem.y[rest], columns=problem.columns[rest], parts=parts, seen=problem.seen[rest]
+            problem,
+            y=problem.y[rest],
+            columns=problem.columns[rest],
+            parts=parts,
+            seen=problem.seen[rest],
+            poses=None,
         )
         without = form(part)
         columns = problem.columns[visits].reshape(-1, problem.columns.shape[2])

@@ -168,7 +168,8 @@ def test_a_terms_size_and_doubt_are_what_it_moves_the_measured_points(monkeypatc
     assert all(t.used for t in terms.values())
     # Of many visits each so many-th stands for the others: of pairs that are alike the first for both.
     pairs = np.repeat(np.arange(6), 2)
-    many = replace(problem, y=problem.y[pairs], columns=problem.columns[pairs], seen=problem.seen[pairs])
+    columns, seen = problem.columns[pairs], problem.seen[pairs]
+    many = replace(problem, y=problem.y[pairs], columns=columns, seen=seen, poses=None)
     many = replace(many, parts={name: part[pairs] for name, part in problem.parts.items()})
     monkeypatch.setattr(term_gain, "ENOUGH", 6)
     for term in term_gain.term_gains(model, many, coefficients, half @ half.T, gains):
