@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike
 from calib_planner.arrays import FloatArray, IntArray, check_array, check_number, frozen
 from calib_planner.error_model.poses import Poses
 from calib_planner.errors import InputError, UnknownNameError
-from calib_planner.robot import Element, Robot, lumped, target_elements
+from calib_planner.robot import Robot, lumped
 
 MOUNTINGS = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0)}
 """Mounting → direction downwards in the frame of the robot's base. A wall needs a direction."""
@@ -148,7 +148,7 @@ class Gravity:
 
     def size(self, robot: Robot) -> int:
         """K."""
-        return len(self._pairs(robot))
+        return len(self.joints(robot))
 
     def columns(self, poses: Poses) -> FloatArray:
         """(N, 3·targets, K) c_l τ_lm [m per rad/m]."""
@@ -162,7 +162,7 @@ class Gravity:
 
     def variances(self, robot: Robot, values: dict[str, float]) -> FloatArray:
         """(K,) prior variance of each coefficient [rad²/m²]."""
-        return np.full(len(self._pairs(robot)), values["gravity"] ** 2)
+        return np.full(self.size(robot), values["gravity"] ** 2)
 
     def gradients(self, robot: Robot, values: dict[str, float]) -> dict[str, FloatArray]:
         """Scale → (K,) derivative of ``variances`` by its logarithm."""
@@ -246,12 +246,18 @@ class Gravity:
         if key not in poses.cache:
             origins = poses.posture.joint_origins.transpose(1, 2, 0)
             parts = self.masses_of(poses.robot)
-            points = [link_points(poses.robot, poses.q, part.joint, part.xyz).T for part in parts]
+            points = [poses.robot.link_points(poses.q, part.joint, part.xyz).T for part in parts]
             poses.cache[key] = np.stack(points)[:, None] - origins
         return poses.cache[key]
 
     def moments(self, poses: Poses) -> FloatArray:
-        """(N, K) τ [m], or the force along a sliding joint, of a unit weight."""
+        """(N, K) τ [m], or the force along a sliding joint, of a unit weight; kept with the poses."""
+        key = ("moments", self)
+        if key not in poses.cache:
+            poses.cache[key] = self._moments(poses)
+        return poses.cache[key]
+
+    def _moments(self, poses: Poses) -> FloatArray:
         robot, (axes, sideways) = poses.robot, self._axes(poses)
         turning = (self._arms(poses) * sideways).sum(axis=2)  # (w × arm) · d = arm · (d × w)
         pull = np.einsum("x,lxn->ln", self._down(robot), axes)
@@ -307,30 +313,3 @@ def _direction(field: str, given: ArrayLike, way: str) -> tuple[float, float, fl
         raise InputError(field, "0, 0, 0", f"a direction {way}")
     x, y, z = (float(v) for v in (clean if abs(length - 1.0) < 1e-12 else clean / length))
     return x, y, z
-
-
-def link_points(robot: Robot, q: FloatArray, joint: int | None, xyz: tuple[float, float, float]) -> FloatArray:
-    """(N, 3) where ``xyz`` (3,) of the link that joint number ``joint`` moves is; ``None``: of the tip [m]."""
-    x, y, z = xyz
-    part = _link(robot, joint, (float(x), float(y), float(z)))
-    return part.positions(robot.motions(q)[:, : len(part.joint_names)])[:, 0]
-
-
-@lru_cache(maxsize=64)
-def _link(robot: Robot, joint: int | None, xyz: tuple[float, float, float]) -> Robot:
-    """The robot up to a link, by motions, its target at ``xyz`` of that link; needed at every sample."""
-    branch = target_elements(np.array([xyz]))
-    if joint is None:
-        return replace(robot, targets=branch, parameter_names=(), couplings=())
-    end = next(i for i, e in enumerate(robot.elements) if e.joint == joint) + 1
-    # A joint with an oblique axis is turned back behind its motion; its link is there.
-    before, behind = robot.elements[end - 2], robot.elements[end : end + 2]
-    if len(behind) == 2 and behind[0] == Element(before.kind, -before.value) and before.value:
-        end += 2
-    return Robot(
-        name=robot.name,
-        elements=robot.elements[:end],
-        targets=branch,
-        joint_names=robot.joint_names[: joint + 1],
-        joint_limits=robot.joint_limits[: joint + 1],
-    )

@@ -83,13 +83,13 @@ class JointFunctions:
 
     def columns(self, poses: Poses) -> FloatArray:
         """(N, 3·targets, K) c_l cos n x_l and c_l sin n x_l [m/rad]."""
-        waves, levers = self.waves(poses), poses.levers
+        waves, levers = self.remembered_waves(poses), poses.levers
         return (levers[..., None] * waves[:, None]).reshape(*levers.shape[:2], -1)
 
     def deflection(self, poses: Poses, coefficients: FloatArray) -> FloatArray:
         """(N, joints) φ_l(q_l) for coefficients (K,), in units of ``joint_units``."""
         per_joint = coefficients.reshape(len(poses.robot.joint_names), -1)
-        return np.asarray(np.einsum("njk,jk->nj", self.waves(poses), per_joint))
+        return np.asarray(np.einsum("njk,jk->nj", self.remembered_waves(poses), per_joint))
 
     def waves(self, poses: Poses) -> FloatArray:
         """(N, joints, 2·harmonics) cos n x, then sin n x, n = 1 …"""
@@ -98,6 +98,13 @@ class JointFunctions:
         x = np.where(turns, poses.q, np.pi * (poses.q - low) / (high - low))
         turned = np.exp(1j * x)[..., None] ** np.arange(1, self.harmonics + 1)
         return np.concatenate([turned.real, turned.imag], axis=2)
+
+    def remembered_waves(self, poses: Poses) -> FloatArray:
+        """The same, remembered with the poses; not to be written to."""
+        key = ("waves", self.harmonics)
+        if key not in poses.cache:
+            poses.cache[key] = self.waves(poses)
+        return poses.cache[key]
 
     def variances(self, robot: Robot, values: dict[str, float]) -> FloatArray:
         """(K,) prior variance of each coefficient [rad²]."""

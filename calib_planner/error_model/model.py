@@ -255,7 +255,7 @@ class ErrorModel:
 
     def deflected(self, readings: Poses, coefficients: FloatArray) -> Poses:
         """The same configurations with the deflection of β (coefficients,)."""
-        return replace(readings, deflection=self.deflection(readings, coefficients))
+        return readings.deflected(self.deflection(readings, coefficients))
 
     def variances(self, robot: Robot) -> FloatArray:
         """(coefficients,) prior variances, infinite where flat [unit²]; see ``precision`` for M₀."""

@@ -99,12 +99,20 @@ class Placement:
 
     def _rows(self, robot: Robot) -> dict[str, BoolArray]:
         """Scale → (P,) whether a parameter's prior is that scale."""
-        free = is_placement(robot.parameter_names) & ~joint_zeros(robot)
+        rows = _toleranced(robot)
         if self.stated is not None:
+            free = np.ones(len(robot.parameter_names), bool)
             free[self.stated.places(robot.parameter_names)] = False
-        angle = np.array([p.unit == "rad" for p in robot.parameters], bool)
-        rows = {"placement.length": free & ~angle, "placement.angle": free & angle}
+            rows = {n: r & free for n, r in rows.items()}
         return {n: r for n, r in rows.items() if n in self.scales and r.any()}
+
+
+@lru_cache(maxsize=64)
+def _toleranced(robot: Robot) -> dict[str, BoolArray]:
+    """Scale → (P,) whether a parameter of the chain, no joint's zero, is such a length or angle."""
+    free = is_placement(robot.parameter_names) & ~joint_zeros(robot)
+    angle = np.array([p.unit == "rad" for p in robot.parameters], bool)
+    return {"placement.length": free & ~angle, "placement.angle": free & angle}
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,7 @@ angle, a moment of gravity) is taken at the readings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,8 +42,16 @@ class Poses:
 
     @cached_property
     def cache(self) -> dict[object, FloatArray]:
-        """What a term computes of these poses and needs again."""
+        """What a term computes of these readings and needs again; no deflection changes it."""
         return {}
+
+    def deflected(self, deflection: FloatArray) -> Poses:
+        """The same readings with a deflection (N, joints); what depends on readings alone is kept."""
+        result = replace(self, deflection=deflection)
+        result.__dict__["cache"] = self.cache
+        if "posture" in self.__dict__:
+            result.__dict__["posture"] = self.posture
+        return result
 
     @property
     def actual(self) -> FloatArray:

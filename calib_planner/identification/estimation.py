@@ -101,6 +101,8 @@ GROWN = 2.0
 """Times as many visits as the scales come from: by then their standard deviations could be a third less."""
 OFF = 1.25
 """Squared left-out residuals, over what is predicted, that change by this factor show that the scales are off."""
+MOST_POSES = 2
+"""Places whose poses are remembered: where it was linearised, and where a step went."""
 BASE_ELEMENTS = 9
 """The first elements of a robot place its base (``Robot.with_base``)."""
 CHORDS = 8
@@ -202,6 +204,7 @@ class _Work:
         self.at = self.state.coefficients
         self.rounds, self.converged, self.moved = 0, False, 0.0
         self.shifted = np.zeros(data.seen.shape)
+        self._known: dict[bytes, Poses] = {}
 
     @cached_property
     def groups(self) -> IntArray:
@@ -267,9 +270,14 @@ class _Work:
 
     def _poses(self, coefficients: FloatArray) -> Poses:
         """Parameters and deflected joints at β (coefficients,)."""
-        here = self.here(coefficients)
-        poses = Poses(here, self.data.q, self.state.model.payloads(self.data.payload, len(self.data)))
-        return replace(poses, deflection=self.state.model.deflection(poses, coefficients))
+        known, key = self._known, coefficients.tobytes()
+        if key not in known:
+            if len(known) >= MOST_POSES:
+                known.pop(next(iter(known)))
+            model, here = self.state.model, self.here(coefficients)
+            readings = Poses(here, self.data.q, model.payloads(self.data.payload, len(self.data)))
+            known[key] = model.deflected(readings, coefficients)
+        return known[key]
 
     def apart(self, coefficients: FloatArray) -> FloatArray:
         """(N, m) measured − predicted at β (coefficients,) [m]; 0 where not measured."""

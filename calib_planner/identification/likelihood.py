@@ -186,7 +186,7 @@ class LinearProblem:
         functions = self.model.joint_functions
         if functions is None or self.poses is None or self.y.size < MANY:
             return None
-        waves = functions.waves(self.poses).transpose(1, 0, 2)
+        waves = functions.remembered_waves(self.poses).transpose(1, 0, 2)
         return self.poses.levers * self.seen[:, :, None], np.ascontiguousarray(waves)
 
     @cached_property

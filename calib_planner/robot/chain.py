@@ -14,7 +14,7 @@ frame once the base pose has been set. Order of joints: ``joint_names``. Order o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,14 +26,18 @@ from calib_planner.arrays import FloatArray, check_array, check_configurations, 
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.robot.coupling import Coupling, coupling_matrix, enclosing_limits
 from calib_planner.robot.elements import Element, roll_pitch_yaw, rotation
-from calib_planner.robot.kinematics import Program, codes_of, compile_program, structure_of
+from calib_planner.robot.kinematics import Program, Structure, codes_of, compile_program, structure_of
 from calib_planner.robot.linearisation import Layout, Linearisation, Posture
 from calib_planner.robot.masses import LinkMass, fault_of
 from calib_planner.robot.parameters import Parameter, resolve_parameters
 from calib_planner.units import Told, listed
 
+POINT = (Element("Tx"), Element("Ty"), Element("Tz"))
+"""The branch from a link to a point of it."""
 MOST_PROGRAMS = 64
 """Programs that a robot remembers."""
+OF_STRUCTURE = ("coupling", "_layout", "_turning", "_programs")
+"""What a robot has computed that does not depend on the amounts of its elements."""
 LIMIT_TOLERANCE = 1e-6
 """A coordinate beyond its joint limit by less than this is on it [rad | m]: files and screens round limits and
 coordinates to six decimals."""
@@ -149,13 +153,14 @@ class Robot(Told):
 
         def moved(e: Element) -> Element:
             delta = deviations.get(e.parameter or "", 0.0)
-            return replace(e, value=e.value + float(delta)) if delta else e
+            return e.moved(float(delta)) if delta else e
 
-        return replace(
-            self,
-            elements=tuple(map(moved, self.elements)),
-            targets=tuple(tuple(map(moved, branch)) for branch in self.targets),
-        )
+        result = object.__new__(Robot)  # other amounts: nothing to check, and its programs are the same
+        same = (*(f.name for f in fields(Robot)), *OF_STRUCTURE)
+        result.__dict__.update((name, getattr(self, name)) for name in same)
+        result.__dict__["elements"] = tuple(map(moved, self.elements))
+        result.__dict__["targets"] = tuple(tuple(map(moved, branch)) for branch in self.targets)
+        return result
 
     def with_base(self, rotation_matrix: ArrayLike, xyz: ArrayLike) -> Robot:
         """The robot placed at ``xyz`` [m] with axes ``rotation_matrix`` (3, 3), e.g. in a tracker's frame."""
@@ -344,6 +349,35 @@ class Robot(Told):
             tip_origin=points[:, -1],
         )
 
+    def link_points(self, q: ArrayLike, joint: int | None, xyz: Sequence[float]) -> FloatArray:
+        """(N, 3) where a point of a link is [m].
+
+        Args:
+            q: (N, joints) joint coordinates [rad | m].
+            joint: Number of the joint that moves the link; ``None``: the tip.
+            xyz: (3,) the point in the frame of the link, or of the tip [m].
+        """
+        moved, trunk = np.ascontiguousarray(self.motions(self._check_q(q)).T), self._trunk_to(joint)
+        amounts = np.concatenate([self._nominal_amounts[: len(trunk)], xyz])
+        turning = np.concatenate([self._turning[: len(trunk)], np.zeros(3, bool)])
+        codes = codes_of(amounts, turning)
+
+        def structure() -> Structure:
+            return structure_of(trunk, (POINT,), codes.tolist(), (), ())
+
+        return self._remembered(("link", codes.tobytes()), structure).run(moved, amounts).T
+
+    def _trunk_to(self, joint: int | None) -> tuple[Element, ...]:
+        """The elements up to the link that a joint moves; ``None``: up to the tip."""
+        if joint is None:
+            return self.elements
+        end = self._layout.joint_elements[joint] + 1
+        # A joint with an oblique axis is turned back behind its motion; its link is there.
+        before, behind = self.elements[end - 2], self.elements[end : end + 2]
+        if len(behind) == 2 and behind[0] == Element(before.kind, -before.value) and before.value:
+            end += 2
+        return self.elements[:end]
+
     # ── inside: arrays are clean from here on ────────────────────────────────────────────────────────
 
     def _check_q(self, q: ArrayLike) -> FloatArray:
@@ -388,23 +422,34 @@ class Robot(Told):
         joints, trunk = self._layout.joint_elements, len(self.elements)
         # A target's branch begins with Tx, Ty, Tz from the tip: their axes are the tip's.
         axes, origins = (*joints, trunk, trunk + 1, trunk + 2), (*joints, trunk - 1)
-        codes = self._nominal_codes.tolist()
-        return compile_program(structure_of(self.elements, self.targets, codes, (), axes, origins))
+        codes = self._nominal_codes
+
+        def structure() -> Structure:
+            return structure_of(self.elements, self.targets, codes.tolist(), (), axes, origins)
+
+        return self._remembered(("posture", codes.tobytes()), structure)
 
     @cached_property
-    def _programs(self) -> dict[tuple[bytes, Sequence[int], Sequence[int]], Program]:
+    def _programs(self) -> dict[tuple[Any, ...], Program]:
         return {}
+
+    def _remembered(self, key: tuple[Any, ...], structure: Callable[[], Structure]) -> Program:
+        """The program of a structure, remembered by ``key``, which holds the codes and what is wanted."""
+        known = self._programs
+        if key not in known:
+            if len(known) >= MOST_PROGRAMS:
+                known.pop(next(iter(known)))
+            known[key] = compile_program(structure())
+        return known[key]
 
     def _program(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
         """The compiled chain: the amounts matter by their codes alone, and programs are remembered by them."""
         codes = self._nominal_codes if amounts is self._nominal_amounts else codes_of(amounts, self._turning)
-        known, key = self._programs, (codes.tobytes(), columns, axes)
-        if key not in known:
-            if len(known) >= MOST_PROGRAMS:
-                known.pop(next(iter(known)))
-            structure = structure_of(self.elements, self.targets, codes.tolist(), columns, axes)
-            known[key] = compile_program(structure)
-        return known[key]
+
+        def structure() -> Structure:
+            return structure_of(self.elements, self.targets, codes.tolist(), columns, axes)
+
+        return self._remembered((codes.tobytes(), columns, axes), structure)
 
     def _amounts(self, deviations: NDArray[Any] | None) -> NDArray[Any]:
         if deviations is None or not deviations.any():

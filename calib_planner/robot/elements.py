@@ -42,6 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import numpy as np
 
@@ -76,6 +77,15 @@ class Element:
             raise InputError(f"element {self.kind}", self.value, "a finite amount")
         if abs(self.sign) != 1.0:
             raise InputError(f"element {self.kind}: sign", self.sign, "+1 or -1")
+
+    def moved(self, delta: float) -> Element:
+        """The same with an amount that is larger by ``delta`` [m | rad]."""
+        value = self.value + delta
+        if not isfinite(value):
+            return replace(self, value=value)  # which says what is wrong
+        result = object.__new__(Element)  # all else was checked when this one was made
+        result.__dict__.update(self.__dict__, value=value)
+        return result
 
     @property
     def axis(self) -> int:

@@ -13,7 +13,6 @@ from robots import MIXED_URDF, mixed, random_configurations
 from calib_planner import InputError, Robot, UnknownNameError
 from calib_planner.cli import main
 from calib_planner.error_model import Gravity, Mass, Poses
-from calib_planner.error_model.gravity import link_points
 from calib_planner.io import parse_urdf, read_estimate
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.robot import Coupling, goals_of, parse_coupling, solve
@@ -263,10 +262,9 @@ def test_a_mass_loads_the_joints_that_move_it(joint: int) -> None:
         [parse_coupling(f"{names[1]}+=0.5*{names[3]}"), parse_coupling(f"{names[5]}-={names[4]}")]
     )
     q = random_configurations(robot, 3)
-    at = link_points(robot, q, joint, (0.1, 0.2, 0.3))
+    at = robot.link_points(q, joint, (0.1, 0.2, 0.3))
     moves = [
-        np.abs(link_points(robot, q + 1e-3 * unit, joint, (0.1, 0.2, 0.3)) - at).max() > 1e-6
-        for unit in np.eye(6)
+        np.abs(robot.link_points(q + 1e-3 * unit, joint, (0.1, 0.2, 0.3)) - at).max() > 1e-6 for unit in np.eye(6)
     ]
     term = Gravity((Mass("load", joint, (0.1, 0.2, 0.3)),))
     loaded = [name.removeprefix("gravity.load.") for name in term.names(robot)]

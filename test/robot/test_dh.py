@@ -14,7 +14,6 @@ from robots import SHARED_DATA, random_configurations
 
 from calib_planner import FileFormatError, IdentificationProblem, Robot, identify
 from calib_planner.error_model import ErrorModel
-from calib_planner.error_model.gravity import link_points
 from calib_planner.simulation import SimulatedCell
 
 STEP = 1e-30
@@ -308,7 +307,7 @@ def test_nearly_parallel_axes_are_re_placed(tmp_path, key, tilt):
             key, rows[: part.joint + 1], joints[: part.joint + 1], q[:, : part.joint + 1], [[0.01, 0.02, 0.03]]
         )
         np.testing.assert_allclose(
-            link_points(robot, q, part.joint, part.xyz), own, atol=1e-14 / np.sin(tilt) + 1e-12
+            robot.link_points(q, part.joint, part.xyz), own, atol=1e-14 / np.sin(tilt) + 1e-12
         )
 
 
