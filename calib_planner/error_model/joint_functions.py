@@ -72,10 +72,7 @@ class JointFunctions:
 
     def names(self, robot: Robot) -> tuple[str, ...]:
         """K = joints · 2 · harmonics names ``<joint>.cos1 …, <joint>.sin1 …``."""
-        orders = range(1, self.harmonics + 1)
-        return tuple(
-            f"{joint}.{wave}{n}" for joint in robot.joint_names for wave in ("cos", "sin") for n in orders
-        )
+        return _names(robot.joint_names, self.harmonics)
 
     def size(self, robot: Robot) -> int:
         """K."""
@@ -130,7 +127,13 @@ class JointFunctions:
         return result
 
     def _spread(self, robot: Robot, per_order: FloatArray) -> FloatArray:
-        return np.tile(per_order, 2 * len(robot.joint_names))
+        return np.concatenate([per_order] * (2 * len(robot.joint_names)))
+
+
+@lru_cache(64)
+def _names(joints: tuple[str, ...], harmonics: int) -> tuple[str, ...]:
+    orders = range(1, harmonics + 1)
+    return tuple(f"{joint}.{wave}{n}" for joint in joints for wave in ("cos", "sin") for n in orders)
 
 
 @lru_cache(256)  # a fit wants the same lengths again and again, and Bessel functions take a tenth of its time

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,14 @@ class Scale:
             number = check_number(name, getattr(self, field), low=low, low_open=low == 0.0, unit=self.unit)
             object.__setattr__(self, field, number)
 
+    def at(self, value: float) -> Scale:
+        """The same with another value [unit]."""
+        if not 0.0 < value < inf:
+            return replace(self, value=value)  # which says what is wrong
+        result = object.__new__(Scale)  # all else was checked when this one was made
+        result.__dict__.update(self.__dict__, value=float(value))
+        return result
+
     @property
     def known(self) -> bool:
         """Whether the data have no say."""
@@ -133,8 +142,10 @@ class ErrorModel:
         """The same terms with other values of the scales; those not named stay."""
         for wrong in set(values) - {s.name for s in self.scales}:
             raise UnknownNameError("error_model.scales", wrong, [s.name for s in self.scales])
-        scales = tuple(replace(s, value=values.get(s.name, s.value)) for s in self.scales)
-        return replace(self, scales=scales, name=self.name if name is None else name)
+        result = object.__new__(ErrorModel)  # the same scales: nothing to check
+        scales = tuple(s.at(values[s.name]) if s.name in values else s for s in self.scales)
+        result.__dict__.update(self.__dict__, scales=scales, name=self.name if name is None else name)
+        return result
 
     def with_noise(self, noise: Noise | float) -> ErrorModel:
         """The same with a stated instrument, or σ of every coordinate [m].

@@ -58,7 +58,7 @@ from calib_planner.identification.likelihood import (
     maximise,
     solve,
 )
-from calib_planner.identification.registration import place, tip_poses
+from calib_planner.identification.registration import place_points, tip_poses
 from calib_planner.measurements import Measurements
 from calib_planner.robot import BASE_PARAMETERS, Coupling, Robot, is_nuisance, target_parameters
 from calib_planner.units import SPELLINGS, counted, length, listed, milliradians
@@ -1365,22 +1365,22 @@ class _Gross:
             if change.ratio is not None:
                 moved[:, change.ratio] += (ratio - 1.0) * q[:, change.ratio]
             tips = self._tip(moved)
-            data = Measurements(robot.joint_names, moved, p / scale)
+            measured = p / scale
             if change.base or change.tool:
                 poses = tips if change.base else _carried(tips, robot.base_pose)
-                put = place(robot, data, poses, base=change.base, tool=change.tool, weights=weights)
+                put = place_points(robot, measured, poses, base=change.base, tool=change.tool, weights=weights)
                 rotation = put.rotation if change.base else robot.base_pose[0]
                 offsets, points = put.offsets, put.positions(poses)
             else:
                 rotation, offsets = robot.base_pose[0], robot.target_offsets
                 turned, origins = _carried(tips, robot.base_pose)
                 points = offsets @ turned.transpose(0, 2, 1) + origins[:, None]
-            apart = np.where(seen[:, :, None], data.p - points, 0.0)
+            apart = np.where(seen[:, :, None], measured - points, 0.0)
             lengths = np.linalg.norm(apart, axis=2)
             level = float(np.median(lengths[seen]))
             weights = np.where(seen, 1.0 / (1.0 + (lengths / max(level, 1e-9)) ** 2), 0.0)
             if change.scale and not fit:
-                scale *= _stretch(data.p, points, weights, free=change.base)
+                scale *= _stretch(measured, points, weights, free=change.base)
             if fit:
                 step = self._step(
                     change, moved, q, (rotation, offsets, points), apart, (weights, max(level, 1e-6))

@@ -101,9 +101,22 @@ def place(
     Args:
         weights: (N, targets) >= 0, how much each point counts; default all alike.
     """
+    return place_points(robot, data.p, poses, base=base, tool=tool, weights=weights)
+
+
+def place_points(
+    robot: Robot,
+    points: FloatArray,
+    poses: tuple[FloatArray, FloatArray],
+    *,
+    base: bool,
+    tool: bool,
+    weights: FloatArray | None = None,
+) -> Placement:
+    """The same for ``points`` (N, targets, 3) [m], NaN where not measured."""
     rotations, origins = poses
-    row, target = np.nonzero(data.seen)
-    p, r, o = data.p[row, target], rotations[row], origins[row]
+    row, target = np.nonzero(~np.isnan(points[:, :, 0]))
+    p, r, o = points[row, target], rotations[row], origins[row]
     root = np.ones(len(row)) if weights is None else np.sqrt(weights[row, target])
     offsets = robot.target_offsets
     matrix: FloatArray = np.eye(3)

@@ -358,9 +358,10 @@ class Robot(Told):
             xyz: (3,) the point in the frame of the link, or of the tip [m].
         """
         moved, trunk = np.ascontiguousarray(self.motions(self._check_q(q)).T), self._trunk_to(joint)
-        amounts = np.concatenate([self._nominal_amounts[: len(trunk)], xyz])
-        turning = np.concatenate([self._turning[: len(trunk)], np.zeros(3, bool)])
-        codes = codes_of(amounts, turning)
+        point = np.array(xyz, float)
+        amounts = np.concatenate([self._nominal_amounts[: len(trunk)], point])
+        own = codes_of(point, np.zeros(len(POINT), bool))
+        codes = np.concatenate([self._nominal_codes[: len(trunk)], own])
 
         def structure() -> Structure:
             return structure_of(trunk, (POINT,), codes.tolist(), (), ())

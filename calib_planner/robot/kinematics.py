@@ -602,12 +602,13 @@ def _turns(
 
 
 def _needed(tracer: Tracer, outputs: list[Ref]) -> list[int]:
-    """Nodes that some output depends on, in the order in which they were made."""
-    needed = {0}
-    stack = [node for sign, node in outputs if sign]
-    while stack:
-        node = stack.pop()
-        if node not in needed:
-            needed.add(node)
-            stack.extend(_operands(tracer, node))
-    return sorted(needed)
+    """Nodes that some output depends on, in the order in which they were made, operands first."""
+    wanted = [True] + [False] * (len(tracer.nodes) - 1)
+    for sign, node in outputs:
+        if sign:
+            wanted[node] = True
+    for node in range(len(wanted) - 1, 0, -1):
+        if wanted[node]:
+            for operand in _operands(tracer, node):
+                wanted[operand] = True
+    return [node for node, needed in enumerate(wanted) if needed]
