@@ -35,6 +35,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -436,25 +437,41 @@ class ManagedNode(TidyLifecycleNode, Generic[P]):
     # ── callbacks that do not end the process ────────────────────────────────────────────────────────
 
     def _safe(self, callback: Callable[..., None]) -> Callable[..., None]:
+        level = self._level()
+
         @functools.wraps(callback)
         def safe(*args: Any) -> None:
             try:
                 callback(*args)
             except Exception as error:
-                self._say(error)
+                self._say_unless_left(error, level)
 
         return safe
 
     def _safe_service(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        level = self._level()
+
         @functools.wraps(callback)
         def safe(request: Any, response: Any) -> Any:
             try:
                 return callback(request, response)
             except Exception as error:
-                self._say(error)
+                self._say_unless_left(error, level)
                 return failed(type(response), reason_of(error))
 
         return safe
+
+    def _level(self) -> ExitStack | None:
+        """What the transition under way makes; ``None`` before the first."""
+        return self._made[-1] if self._made else None
+
+    def _say_unless_left(self, error: Exception, level: ExitStack | None) -> None:
+        """Say what a callback raised, which was made at a level.
+
+        In a node of several threads one may destroy, on the way back, what another one's callback is using.
+        """
+        if not (isinstance(error, InvalidHandle) and level is not None and level not in self._made):
+            self._say(error)
 
     def _say(self, error: Exception) -> None:
         self._fault = reason_of(error)

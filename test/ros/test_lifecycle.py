@@ -151,6 +151,20 @@ def test_an_exception_in_a_callback_is_survived(bench: Bench) -> None:
     assert not answer.success and "made for this test" in answer.message
 
 
+def test_a_callback_may_be_at_work_while_what_it_uses_is_destroyed_on_the_way_back(bench: Bench) -> None:
+    node = bench.start(Small)
+    begun = node.heard.callback
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    begun(String(data="late"))
+    assert not bench.unforeseen
+    node.trigger_configure()
+    node.said.destroy()
+    node.heard.callback(String(data="destroyed by somebody else"))
+    assert [type(error).__name__ for error in bench.unforeseen] == ["InvalidHandle"]
+    bench.unforeseen.clear()
+
+
 def set_one(bench: Bench, name: str, value: ParameterValue) -> str:
     """The reason why it was refused; empty if it was not."""
     request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=value)])
