@@ -427,10 +427,8 @@ CLOSE_ENOUGH = 1e-2
 
 def _heights(model: Model, gradient: FloatArray, q: FloatArray) -> FloatArray:
     """d(q) = tr(G I_1(q)) at ``q`` (N, joints): (N,)."""
-    if isinstance(model, ExtendedModel):
-        rows = model.whitened(q)
-        return np.asarray(np.sum((rows @ gradient) * rows, axis=(1, 2)))
-    return np.asarray(np.einsum("nab,ab->n", model.at(q), gradient))
+    rows = model.whitened(q)
+    return np.asarray(np.sum((rows @ gradient) * rows, axis=(1, 2)))
 
 
 def _whitened(model: Model, q: FloatArray) -> FloatArray:

@@ -39,7 +39,7 @@ from calib_planner.errors import InfeasibleError, InputError
 from calib_planner.planning.criteria import POSE_CRITERIA, Criterion, reported_value, ridged
 from calib_planner.planning.extended import ExtendedModel
 from calib_planner.planning.information import PlanSpace, plan_space, smallest_size, spread_spaces
-from calib_planner.planning.planner import GOOD_ENOUGH, Callback, judged, plan, psi_of, value_of
+from calib_planner.planning.planner import GOOD_ENOUGH, Callback, judged, plan, psi_of, value_in
 from calib_planner.planning.problem import PlanProblem
 from calib_planner.planning.result import Plan
 from calib_planner.planning.tour import Pace, Timetable, visit_times, visiting_order
@@ -138,12 +138,14 @@ def _sizes(smallest: int) -> Iterator[int]:
 
 def _smallest_repetition(problem: PlanProblem, k: int, accuracy: float) -> Plan | None:
     """The plan of k configurations with the fewest repetitions that reaches ``accuracy``."""
-    once = plan(replace(problem, configurations=k, repetitions=1))
+    single = replace(problem, configurations=k, repetitions=1)
+    once = plan(single)
     if once.quality.value <= accuracy:
         return once
+    space = plan_space(single)
 
     def value(r: int) -> float:
-        return value_of(replace(problem, configurations=k, repetitions=r), once.configurations)
+        return value_in(space.repeated(r), once.configurations)
 
     low, high = 1, MOST_MEASUREMENTS // k
     if not value(high) <= accuracy:
@@ -357,8 +359,7 @@ class _Tour:
 
     def _psi(self, space: PlanSpace, criterion: Criterion, counts: IntArray) -> float:
         """Ψ as ``plan`` reports it."""
-        visited = replace(space, model=replace(space.model, repetitions=counts))
-        return psi_of(visited, criterion, self.configurations)
+        return psi_of(space.repeated(counts), criterion, self.configurations)
 
     def _given_away(self, counts: IntArray, extra: int) -> IntArray:
         """``extra`` visits more, each where it tells most."""

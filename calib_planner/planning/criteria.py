@@ -29,7 +29,7 @@ Pathre 1990; O3, O4: Nahvi et al. 1994, 1996; O5: Sun and Hollerbach 2008.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -54,6 +54,10 @@ class Criterion(Protocol):
         """``matrices`` (S, p, p) → Ψ (S,), to be maximised, and ∂Ψ/∂M (S, p, p)."""
         ...
 
+    def values(self, matrices: FloatArray) -> FloatArray:
+        """The same Ψ (S,) without the gradient, to rounding."""
+        ...
+
     def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         """G (p, p) of (B) at ``matrix`` for the *exact* criterion, where the search uses a smooth one."""
         ...
@@ -68,11 +72,19 @@ class Criterion(Protocol):
 
 
 def _symmetric(gradient: FloatArray) -> FloatArray:
-    return 0.5 * (gradient + np.swapaxes(gradient, -1, -2))
+    result = gradient + gradient.swapaxes(-1, -2)
+    result *= 0.5
+    return result
 
 
 class _Exact:
-    """What follows from ``exact_values``."""
+    """What follows from ``exact_values`` and ``value_and_gradient``."""
+
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        raise NotImplementedError
+
+    def values(self, matrices: FloatArray) -> FloatArray:
+        return self.value_and_gradient(matrices)[0]
 
     def exact_values(self, matrices: FloatArray) -> FloatArray:
         raise NotImplementedError
@@ -86,14 +98,11 @@ class _Smooth(_Exact):
 
     concave = True
 
-    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        raise NotImplementedError
-
     def supporting_gradient(self, matrix: FloatArray) -> FloatArray:
         return self.value_and_gradient(matrix[None])[1][0]
 
     def exact_values(self, matrices: FloatArray) -> FloatArray:
-        return self.value_and_gradient(matrices)[0]
+        return self.values(matrices)
 
 
 @dataclass(frozen=True)
@@ -110,9 +119,11 @@ class Accuracy(_Smooth):
         inverse = np.linalg.inv(matrices)
         half = inverse @ self.weight
         psi = 1.0 / np.einsum("sii->s", half)
-        return np.asarray(psi, np.float64), _symmetric((psi**2)[:, None, None] * (half @ inverse))
+        gradient = half @ inverse
+        gradient *= (psi**2)[:, None, None]
+        return psi, _symmetric(gradient)
 
-    def exact_values(self, matrices: FloatArray) -> FloatArray:
+    def values(self, matrices: FloatArray) -> FloatArray:
         return np.asarray(1.0 / np.einsum("sab,ba->s", np.linalg.inv(matrices), self.weight))
 
 
@@ -135,12 +146,19 @@ class WorstAccuracy(_Exact):
         inverse = np.linalg.inv(matrices)
         return np.asarray(inverse, np.float64), np.einsum("sab,kba->sk", inverse, self.weights)
 
-    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        inverse, values = self._values(matrices)
+    def _power_mean(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Ψ (S,), powers (S, K) and their mean (S,) of the variances ``values`` (S, K)."""
         top = values.max(axis=1, keepdims=True)
         powers = (values / top) ** self.sharpness
         total = powers.mean(axis=1)
-        psi = 1.0 / (top[:, 0] * total ** (1.0 / self.sharpness))
+        return 1.0 / (top[:, 0] * total ** (1.0 / self.sharpness)), powers, total
+
+    def values(self, matrices: FloatArray) -> FloatArray:
+        return self._power_mean(self._values(matrices)[1])[0]
+
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inverse, values = self._values(matrices)
+        psi, powers, total = self._power_mean(values)
         share = powers / values / (total * len(self.weights))[:, None]
         mixed = np.einsum("sk,kab->sab", share, self.weights)
         return psi, _symmetric(psi[:, None, None] * (inverse @ mixed @ inverse))
@@ -159,10 +177,12 @@ class WorstAccuracy(_Exact):
 class Determinant(_Smooth):
     """det(M)^(1/p): the D-criterion, invariant under the units of the parameters up to a constant."""
 
-    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        size = matrices.shape[-1]
+    def values(self, matrices: FloatArray) -> FloatArray:
         sign, log = np.linalg.slogdet(matrices)
-        psi = np.where(sign > 0, np.exp(log / size), 0.0)
+        return np.where(sign > 0, np.exp(log / matrices.shape[-1]), 0.0)
+
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        size, psi = matrices.shape[-1], self.values(matrices)
         return psi, _symmetric(psi[:, None, None] / size * np.linalg.inv(matrices))
 
 
@@ -252,13 +272,20 @@ class Compound(_Smooth):
     shares: tuple[float, ...]
     references: tuple[float, ...]
 
-    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = [c.value_and_gradient(matrices) for c in self.criteria]
+    def _mean(self, values: Iterable[FloatArray]) -> FloatArray:
+        """Ψ (S,) of those of the parts (S,)."""
         log = sum(
             w * np.log(np.maximum(psi / r, 1e-300))
-            for w, r, (psi, _) in zip(self.shares, self.references, parts, strict=True)
+            for w, r, psi in zip(self.shares, self.references, values, strict=True)
         )
-        value = np.exp(log)
+        return np.asarray(np.exp(log))
+
+    def values(self, matrices: FloatArray) -> FloatArray:
+        return self._mean(c.values(matrices) for c in self.criteria)
+
+    def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+        parts = [c.value_and_gradient(matrices) for c in self.criteria]
+        value = self._mean(psi for psi, _ in parts)
         gradient = sum(
             (w * value / psi)[:, None, None] * g for w, (psi, g) in zip(self.shares, parts, strict=True)
         )
@@ -298,6 +325,9 @@ class Eliminating(_Exact):
         lift[:, n] = -solved
         schur = matrices[:, i][:, :, i] - np.swapaxes(cross, 1, 2) @ solved
         return _symmetric(schur), lift
+
+    def values(self, matrices: FloatArray) -> FloatArray:
+        return self.inner.values(self._reduce(matrices)[0])
 
     def value_and_gradient(self, matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         schur, lift = self._reduce(matrices)
@@ -405,13 +435,15 @@ def make_criterion(
 
 def ridged(matrices: FloatArray) -> FloatArray:
     """(S, p, p) information matrices with so small a ridge that a singular one has a small value, not none."""
-    ridge = RIDGE * np.einsum("sii->si", matrices).mean(axis=1)
-    return np.asarray(matrices + ridge[:, None, None] * np.eye(matrices.shape[-1]))
+    result = np.array(matrices)
+    diagonal = np.einsum("sii->si", result)  # a view
+    diagonal += RIDGE * diagonal.mean(axis=1, keepdims=True)
+    return result
 
 
 def log_values(criterion: Criterion, matrices: FloatArray) -> FloatArray:
     """log Ψ (S,) of information matrices (S, p, p), −∞ where it is none."""
-    psi = criterion.value_and_gradient(matrices)[0]
+    psi = criterion.values(matrices)
     usable = np.isfinite(psi) & (psi > 0)
     return np.where(usable, np.log(np.where(usable, psi, 1.0)), -np.inf)
 

@@ -192,9 +192,7 @@ class ExtendedModel:
 
     def floor(self, q: FloatArray) -> FloatArray:
         """(N,) mean square distance that the eliminated functions move the targets at ``q`` (N, joints) [m²]."""
-        info = self.linearised(q)
-        own = np.sum(info.rest**2, axis=2)
-        return np.asarray(np.einsum("nrl,nl->n", info.levers**2, own) / len(self.robot.targets))
+        return self.linearised(q).floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +229,12 @@ class LinearisedExtension:
     def rest(self) -> FloatArray:
         """(N, joints, F) Φ_l (I − U_l U_lᵀ)."""
         return self.features[0] - _through(self.explicit[0], np.swapaxes(self.model.basis, 1, 2))
+
+    @property
+    def floor(self) -> FloatArray:
+        """(N,) mean square distance that the eliminated functions move the targets [m²]."""
+        own = np.sum(self.rest**2, axis=2)
+        return np.asarray(np.einsum("nrl,nl->n", self.levers**2, own) / len(self.model.robot.targets))
 
     @cached_property
     def jacobian(self) -> FloatArray:

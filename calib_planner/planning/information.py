@@ -24,6 +24,7 @@ out first (see ``robot.analyse``), so that every matrix is invertible for some p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,13 +83,13 @@ class InformationModel:
         points, jacobian = self.robot.positions_and_jacobian(q)
         jacobian = np.ascontiguousarray(jacobian)
         if isinstance(self.noise, Isotropic):
-            return jacobian / np.sqrt(self.noise.sigma**2 / self._times(3) + self.configuration_sigma**2)
+            return jacobian / np.sqrt(self._variance)
         whitener = np.linalg.inv(np.linalg.cholesky(self._covariance(points)))
         return (whitener @ jacobian.reshape(*points.shape, -1)).reshape(jacobian.shape)
 
     def linearised(self, q: FloatArray) -> LinearisedInformation:
         """The same with what its gradient needs."""
-        lin = self.robot._linearise(q, np.zeros(len(self.robot.parameter_names)))
+        lin = self.robot._linearise(q, None)
         jacobian = lin.jacobian()
         weighted = self._weigh(lin.points.transpose(2, 0, 1), jacobian)
         return LinearisedInformation(self, lin, jacobian, weighted)
@@ -96,10 +97,15 @@ class InformationModel:
     def _weigh(self, points: FloatArray, jacobian: FloatArray) -> FloatArray:
         """W J, (N, 3·targets, p)."""
         if isinstance(self.noise, Isotropic):
-            variance = self.noise.sigma**2 / self._times(3) + self.configuration_sigma**2
-            return jacobian / variance
+            return jacobian / self._variance
         blocks = jacobian.reshape(*points.shape, -1)
         return (np.linalg.inv(self._covariance(points)) @ blocks).reshape(jacobian.shape)
+
+    @cached_property
+    def _variance(self) -> FloatArray:
+        """(1, 1, 1) or (N, 1, 1) Σ/r + σ_c² of isotropic noise [m²]."""
+        assert isinstance(self.noise, Isotropic)
+        return self.noise.sigma**2 / self._times(3) + self.configuration_sigma**2
 
     def _covariance(self, points: FloatArray) -> FloatArray:
         common = self.configuration_sigma**2 * np.eye(3)
@@ -222,6 +228,10 @@ class PlanSpace:
         """Number of measurements in a plan of the problem's size."""
         return int(np.broadcast_to(self.model.repetitions, (self.problem.configurations,)).sum())
 
+    def repeated(self, repetitions: int | IntArray) -> PlanSpace:
+        """The same with so many visits to each configuration, one number or (m,)."""
+        return replace(self, model=replace(self.model, repetitions=repetitions))
+
     def search_criterion(self) -> Criterion:
         """What the search maximises: the criterion wanted, with a share for accuracy elsewhere."""
         share = self.problem.general_weight
@@ -291,11 +301,13 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         )
     prior = prior_rows.T @ prior_rows
     _check_enough(problem, jacobians[:, :, free], prior[np.ix_(free, free)])
-    robot = replace(problem.robot, joint_limits=feasibility.limits).with_parameters([names[i] for i in free])
+    free_names = tuple(names[i] for i in free)
+    robot = replace(problem.robot, joint_limits=feasibility.limits, parameter_names=free_names)
     interest = tuple(i for i, n in enumerate(robot.parameter_names) if not is_nuisance(n)) or tuple(
         range(len(free))
     )
-    model, single = (_model(problem, robot, r) for r in (problem.repetitions, 1))
+    model = _model(problem, robot)
+    single = replace(model, repetitions=1)
     known, stated = prior[np.ix_(free, free)], (stated_rows.T @ stated_rows)[np.ix_(free, free)]
     if isinstance(single, ExtendedModel):
         known = _with_other_terms(problem, single, stated)
@@ -303,18 +315,19 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
     tests: FloatArray = np.empty((0, 3 * len(robot.targets), len(known)))
     blind = np.zeros(len(poses), bool)
     floor: FloatArray = np.zeros(len(poses))
+    general_floor = 0.0
+    columns, at_tests = jacobians[:, :, free], robot.positions_and_jacobian(poses)
+    if isinstance(single, ExtendedModel):
+        everywhere, there = single.linearised(q), single.linearised(poses)
+        columns, at_tests = everywhere.jacobian, (robot.positions(poses), there.jacobian)
+        floor, general_floor = there.floor, float(everywhere.floor.mean())
     if len(poses):
-        tests = accuracy_rows(*_points_and_columns(single, poses), frame)
+        tests = accuracy_rows(*at_tests, frame)
         felt = accuracy_rows(*problem.robot.positions_and_jacobian(poses), frame)
         unseen = np.abs(felt @ identifiable.directions.T).max(axis=(1, 2), initial=0.0)
         blind = unseen > FELT * np.abs(felt).max()
         _check_felt(problem, tests)
-    columns = jacobians[:, :, free]
-    general_floor = 0.0
-    if isinstance(single, ExtendedModel):
-        columns = single.columns(q)
-        floor, general_floor = single.floor(poses), float(single.floor(q).mean())
-    everywhere = accuracy_rows(problem.robot.positions(q), columns, frame)
+    general_rows = accuracy_rows(problem.robot.positions(q), columns, frame)
     return PlanSpace(
         problem=problem,
         robot=robot,
@@ -328,23 +341,16 @@ def plan_space(problem: PlanProblem) -> PlanSpace:
         test_jacobians=tests,
         test_floor=floor,
         blind=blind,
-        general=accuracy_weights(everywhere).mean(axis=0),
+        general=accuracy_weights(general_rows).mean(axis=0),
         general_floor=general_floor,
     )
 
 
-def _model(problem: PlanProblem, robot: Robot, repetitions: int) -> Model:
-    model = problem.whole_model
+def _model(problem: PlanProblem, robot: Robot) -> Model:
+    model, sigma = problem.whole_model, problem.configuration_sigma
     if model is None:
-        return InformationModel(robot, problem.instrument, problem.configuration_sigma, repetitions)
-    return ExtendedModel.of(robot, model, problem.test_pose_array, repetitions, problem.configuration_sigma)
-
-
-def _points_and_columns(model: Model, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, targets, 3) and (N, 3·targets, p) at ``q`` (N, joints)."""
-    if isinstance(model, ExtendedModel):
-        return model.robot.positions(q), model.columns(q)
-    return model.robot.positions_and_jacobian(q)
+        return InformationModel(robot, problem.instrument, sigma, problem.repetitions)
+    return ExtendedModel.of(robot, model, problem.test_pose_array, problem.repetitions, sigma)
 
 
 MEASURED_TOGETHER = 60
@@ -433,7 +439,7 @@ def _needed(jacobians: FloatArray, prior: FloatArray) -> tuple[int, int, int]:
     """Configurations needed, equations that each gives, parameters that are not known beforehand."""
     known = int(np.linalg.matrix_rank(prior)) if prior.any() else 0
     unknown = jacobians.shape[2] - known
-    per_row = max(int(np.linalg.matrix_rank(j)) for j in jacobians[:8])
+    per_row = int(np.linalg.matrix_rank(jacobians[:8]).max())
     return -(-unknown // per_row), per_row, unknown
 
 

@@ -182,14 +182,19 @@ def space_of(problem: PlanProblem, configurations: FloatArray, repetitions: Arra
     if counts.shape not in ((), (size,)) or counts.dtype.kind not in "iu" or (counts < 1).any():
         raise InputError("repetitions", counts.tolist(), f"a whole number >= 1, or {size} of them")
     space = plan_space(replace(problem, configurations=size, repetitions=1))
-    return replace(space, model=replace(space.model, repetitions=counts))
+    return space.repeated(counts)
 
 
 def value_of(problem: PlanProblem, configurations: FloatArray) -> float:
     """Value of the criterion (ρ0 [m] for accuracies) of given configurations (m, joints); no search."""
-    space = plan_space(problem)
-    psi = psi_of(space, space.criterion(problem.criterion), configurations)
-    return reported_value(problem.criterion, psi, len(space.interest), problem.measurements)
+    return value_in(plan_space(problem), configurations)
+
+
+def value_in(space: PlanSpace, configurations: FloatArray) -> float:
+    """``value_of`` in the space of the problem."""
+    name = space.problem.criterion
+    psi = psi_of(space, space.criterion(name), configurations)
+    return reported_value(name, psi, len(space.interest), space.measurements)
 
 
 # ── the parts ────────────────────────────────────────────────────────────────────────────────────────
@@ -212,6 +217,8 @@ class _Clock:
         return self.late or self.cancelled
 
     def tell(self, done: int | None = None, log_value: float | None = None, bound: float | None = None) -> None:
+        if self.callback is None:
+            return
         changes: dict[str, float] = {"seconds": self.seconds}
         if done is not None:
             changes["starts_done"] = done
@@ -220,7 +227,7 @@ class _Clock:
         if bound is not None:
             changes["lower_bound"] = self._value(bound)
         self.last = replace(self.last, **changes)  # type: ignore[arg-type]
-        if self.callback is not None and self.callback(self.last):
+        if self.callback(self.last):
             self.cancelled = True
 
     def _value(self, psi: float) -> float:

@@ -98,5 +98,5 @@ def _accuracies(space: PlanSpace, count: int, seed: int) -> FloatArray:
     """(count,) ρ0 [m] of one batch."""
     size = space.problem.configurations
     q = space.feasibility.sample(np.random.default_rng(seed), count * size)
-    psi = space.criterion("test_pose").value_and_gradient(space.model.totals(q, size) + space.prior)[0]
+    psi = space.criterion("test_pose").values(space.model.totals(q, size) + space.prior)
     return np.where(psi > 0, np.maximum(psi, 1e-300) ** -0.5, np.inf)

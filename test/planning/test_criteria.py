@@ -55,6 +55,7 @@ def case(request):
 def test_slope_against_central_differences(case):
     matrices, h = random_matrices(4), 1e-6
     worth, slope = case.value_and_gradient(matrices)
+    np.testing.assert_allclose(case.values(matrices), worth, rtol=1e-12)
     direction = random_matrices(4, 9) - random_matrices(4, 8)
     up, down = (case.value_and_gradient(matrices + s * h * direction)[0] for s in (1, -1))
     np.testing.assert_allclose((slope * direction).sum(axis=(1, 2)), (up - down) / (2 * h), rtol=2e-6)

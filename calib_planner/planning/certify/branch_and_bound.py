@@ -15,11 +15,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.planning.certify.bernstein import Axis, first_boxes, halves
@@ -85,25 +84,27 @@ def maximise(
 
 @dataclass(eq=False)
 class _Boxes:
-    """N boxes: Bernstein forms (N, …), centres (N, k) and numbers of halvings (N, k)."""
+    """N boxes: Bernstein forms (N, …), largest coefficients (N,), centres and numbers of halvings (N, k) each."""
 
     forms: FloatArray
+    tops: FloatArray
     centres: FloatArray
     depths: IntArray
-    tops: FloatArray = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.tops = self.forms.reshape(len(self.forms), -1).max(axis=1)
+    @staticmethod
+    def of(forms: FloatArray, centres: FloatArray, depths: IntArray) -> _Boxes:
+        return _Boxes(forms, forms.reshape(len(forms), -1).max(axis=1), centres, depths)
 
     def __len__(self) -> int:
         return len(self.tops)
 
-    def at(self, rows: IntArray | NDArray[np.bool_]) -> _Boxes:
-        return _Boxes(self.forms[rows], self.centres[rows], self.depths[rows])
+    def at(self, rows: IntArray) -> _Boxes:
+        return _Boxes(self.forms[rows], self.tops[rows], self.centres[rows], self.depths[rows])
 
     def with_(self, others: _Boxes) -> _Boxes:
         return _Boxes(
             np.concatenate([self.forms, others.forms]),
+            np.concatenate([self.tops, others.tops]),
             np.concatenate([self.centres, others.centres]),
             np.concatenate([self.depths, others.depths]),
         )
@@ -129,7 +130,7 @@ class _Search:
         while batch := list(islice(every, self.rows)):
             centres, forms = (np.stack(part) for part in zip(*batch, strict=True))
             upper = max(
-                upper, self._exhaust(_Boxes(forms, centres, np.zeros(centres.shape, np.int64)), tolerance)
+                upper, self._exhaust(_Boxes.of(forms, centres, np.zeros(centres.shape, np.int64)), tolerance)
             )
         return max(upper, self.largest)
 
@@ -146,9 +147,10 @@ class _Search:
             upper = max(upper, float(waiting.tops[~open_].max(initial=0.0)))
             if not open_.any():
                 return upper
-            waiting = waiting.at(open_)
-            full = len(waiting) * self.tensor.size > MEMORY
-            order = np.argsort(-waiting.depths.sum(axis=1) if full else -waiting.tops, kind="stable")
+            rows = np.flatnonzero(open_)
+            full = len(rows) * self.tensor.size > MEMORY
+            rank = -waiting.depths.sum(axis=1) if full else -waiting.tops
+            order = rows[np.argsort(rank[rows], kind="stable")]
             children = self._split(waiting.at(order[: self.rows]))
             self._look_at(children)
             rest = order[self.rows :]
@@ -186,7 +188,7 @@ class _Search:
                 shift = (side - 0.5) * self.halves[j] * 0.5**levels
                 moved = (matrices[:, None] @ forms).reshape(len(rows), *shape[1:])
                 parts.append((moved, boxes.centres[rows] + shift[:, None] * unit, boxes.depths[rows] + unit))
-        return _Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        return _Boxes.of(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _after(shape: tuple[int, ...], axis: int) -> int:
@@ -196,5 +198,7 @@ def _after(shape: tuple[int, ...], axis: int) -> int:
 
 def _bend(forms: FloatArray) -> FloatArray:
     """(N,) largest second difference of (N, before, size, after) along its third axis."""
-    second = forms[:, :, 2:] - 2.0 * forms[:, :, 1:-1] + forms[:, :, :-2]
+    second = 2.0 * forms[:, :, 1:-1]
+    np.subtract(forms[:, :, 2:], second, out=second)
+    second += forms[:, :, :-2]
     return np.asarray(np.abs(second, out=second).reshape(len(forms), -1).max(axis=1))

@@ -77,40 +77,41 @@ def descend(
         cancel: Called before every iteration; ``True`` ends the work with what there is.
         mend: Takes the points before and after a step, (rows, D) each, to where it may lead.
     """
-    x = np.clip(start, low, high)
+    x = np.minimum(np.maximum(start, low), high)
     value, gradient = objective(x)
     rows, size = x.shape
-    inverse = np.broadcast_to(np.eye(size), (rows, size, size)).copy()
-    fresh = np.ones(rows, bool)
-    idle = np.zeros(rows, int)
-    live = np.flatnonzero(np.isfinite(value))
+    ended, ended_value = x.copy(), value.copy()
     evaluations, done = rows, 0
+    # What follows holds the rows that have not ended, ``live`` being their numbers.
+    live: IntArray = np.flatnonzero(np.isfinite(value))
+    x, value, gradient = x[live], value[live], gradient[live]
+    inverse = np.broadcast_to(np.eye(size), (len(live), size, size)).copy()
+    fresh: NDArray[np.bool_] = np.ones(len(live), bool)
+    idle: IntArray = np.zeros(len(live), np.int64)
     while live.size and done < iterations and not cancel():
         done += 1
-        g = gradient[live]
-        direction = _direction(x[live], g, inverse[live], low, high)
-        norm = np.linalg.norm(direction, axis=1)
-        scale = np.where(fresh[live], first_step / np.maximum(norm, 1e-300), 1.0)
-        scale = np.minimum(scale, 2.0 / np.maximum(norm, 1e-300))
+        direction = _direction(x, gradient, inverse, low, high)
+        norm = np.maximum(_lengths(direction), 1e-300)
+        scale = np.minimum(np.where(fresh, first_step / norm, 1.0), 2.0 / norm)
         new_x, new_value, new_gradient, used = _line_search(
-            objective, x[live], value[live], g, direction, scale, low, high, mend
+            objective, x, value, gradient, direction, scale, low, high, mend
         )
         evaluations += used
-        drop = value[live] - new_value
+        drop = value - new_value
         moved = drop > 0
-        step, change = new_x - x[live], new_gradient - g
-        update(inverse, fresh, live[moved], step[moved], change[moved])
         # A failed search restarts from steepest descent once before the row is given up.
-        lost = live[~moved & ~fresh[live]]
-        inverse[lost] = np.eye(size)
-        over = ~moved & fresh[live]
-        fresh[lost] = True
-        x[live[moved]] = new_x[moved]
-        gradient[live[moved]] = new_gradient[moved]
-        value[live[moved]] = new_value[moved]
-        idle[live] = np.where(moved & (drop > tolerance), 0, idle[live] + 1)
-        live = live[~over & (idle[live] < 2)]
-    return Descent(x, value, evaluations)
+        lost, over = ~moved & ~fresh, ~moved & fresh
+        update(inverse, fresh, np.flatnonzero(moved), (new_x - x)[moved], (new_gradient - gradient)[moved])
+        inverse[lost], fresh[lost] = np.eye(size), True
+        x, value, gradient = new_x, new_value, new_gradient
+        idle = np.where(moved & (drop > tolerance), 0, idle + 1)
+        go_on = ~over & (idle < 2)
+        if not go_on.all():
+            ended[live], ended_value[live] = x, value
+            live, fresh, idle = live[go_on], fresh[go_on], idle[go_on]
+            x, value, gradient, inverse = (part[go_on] for part in (x, value, gradient, inverse))
+    ended[live], ended_value[live] = x, value
+    return Descent(ended, ended_value, evaluations)
 
 
 def bound_coordinates(x: FloatArray, g: FloatArray, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
@@ -131,6 +132,11 @@ def _direction(
     return direction
 
 
+def _lengths(rows: FloatArray) -> FloatArray:
+    """(rows,) Euclidean norms of (rows, D)."""
+    return np.asarray(np.sqrt((rows * rows).sum(axis=1)))
+
+
 def _line_search(
     objective: Objective,
     x: FloatArray,
@@ -146,40 +152,49 @@ def _line_search(
     open_rows = np.arange(len(x))
     used = 0
     for _ in range(HALVINGS):
-        trial = np.clip(x[open_rows] + scale[open_rows, None] * direction[open_rows], low, high)
-        trial = mend(x[open_rows], trial)
+        trial = mend(x, np.minimum(np.maximum(x + scale[:, None] * direction, low), high))
         f, df = objective(trial)
         used += len(open_rows)
-        decrease = (g[open_rows] * (trial - x[open_rows])).sum(axis=1)
-        good = np.isfinite(f) & (f <= value[open_rows] + ARMIJO * decrease) & (f < value[open_rows])
+        decrease = (g * (trial - x)).sum(axis=1)
+        good = np.isfinite(f) & (f <= value + ARMIJO * decrease) & (f < value)
         hit = open_rows[good]
         best_x[hit], best_value[hit], best_g[hit] = trial[good], f[good], df[good]
-        open_rows = open_rows[~good]
-        if not open_rows.size:
+        if good.all():
             break
-        scale[open_rows] *= 0.35
+        open_rows, x, value, g, direction, scale = (
+            part[~good] for part in (open_rows, x, value, g, direction, scale)
+        )
+        scale *= 0.35
     return best_x, best_value, best_g, used
+
+
+CACHED = 30_000
+"""Numbers in the inverse Hessians that are updated together: they and what is added to them stay in the cache."""
 
 
 def update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: FloatArray, y: FloatArray) -> None:
     """BFGS update of the inverse Hessians of ``rows``, scaled at first use, skipped where s·y ≤ 0."""
     sy = (s * y).sum(axis=1)
-    good = sy > 1e-10 * np.linalg.norm(s, axis=1) * np.linalg.norm(y, axis=1)
+    good = sy > 1e-10 * _lengths(s) * _lengths(y)
     rows, s, y, sy = rows[good], s[good], y[good], sy[good]
-    if not rows.size:
-        return
-    h = inverse[rows]
-    first = fresh[rows]
-    h[first] *= (sy[first] / (y[first] ** 2).sum(axis=1))[:, None, None]
+    beside = max(CACHED // s.shape[1] ** 2, 1)
+    for part in (slice(first, first + beside) for first in range(0, len(rows), beside)):
+        inverse[rows[part]] = _updated(inverse[rows[part]], fresh[rows[part]], s[part], y[part], sy[part])
+    fresh[rows] = False
+
+
+def _updated(h: FloatArray, first: NDArray[np.bool_], s: FloatArray, y: FloatArray, sy: FloatArray) -> FloatArray:
+    """``update`` of ``h`` (rows, D, D), in place."""
+    if first.any():
+        h[first] *= (sy[first] / (y[first] ** 2).sum(axis=1))[:, None, None]
     hy = np.matmul(h, y[:, :, None])[:, :, 0]
     rho = 1.0 / sy
     weight = rho * (1.0 + rho * (y * hy).sum(axis=1))
     cross = (rho[:, None] * hy)[:, :, None] * s[:, None, :]
     h -= cross
     h -= cross.transpose(0, 2, 1)
-    h += (weight[:, None] * s)[:, :, None] * s[:, None, :]
-    inverse[rows] = h
-    fresh[rows] = False
+    h += np.multiply((weight[:, None] * s)[:, :, None], s[:, None, :], out=cross)
+    return h
 
 
 # ── random feasible steps ─────────────────────────────────────────────────────────────────────────────

@@ -66,11 +66,10 @@ def rounded_rows(problem: ChoiceProblem, places: IntArray, rng: np.random.Genera
 
 def heaviest_places(support: FloatArray, weights: FloatArray, ranges: FloatArray) -> IntArray:
     """(K,) rows of ``support`` (N, joints), one a place, heaviest first; joint ranges (joints,) [rad | m]."""
-    apart = np.abs((support[:, None] - support[None]) / ranges).max(axis=2)
     left, total = np.ones(len(support), bool), []
     for row in np.argsort(-weights, kind="stable"):
         if left[row]:
-            mine = left & (apart[row] < NEAR)
+            mine = left & (np.abs((support - support[row]) / ranges).max(axis=1) < NEAR)
             total.append((float(weights[mine].sum()), int(row)))
             left[mine] = False
     return np.array([row for _, row in sorted(total, key=lambda pair: -pair[0])], np.int64)

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -66,6 +67,13 @@ class Swaps:
         count, columns = len(candidates.poses), candidates.jacobian * candidates.model.column_scales(factor)
         return Swaps(criterion, prior, columns, candidates.covariance(count, factor=factor)[0])
 
+    @cached_property
+    def alone(self) -> FloatArray:
+        """(C, k, k) V_jj of each candidate."""
+        count, k, _ = self.columns.shape
+        every = np.arange(count)
+        return self.covariance.reshape(count, k, count, k)[every, :, every, :]
+
     def added(self, others: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """What (1) has for every candidate beside ``others`` (m,): M_S (p, p), X̃ (C, k, p) and Ṽ (C, k, k)."""
         count, k, p = self.columns.shape
@@ -74,10 +82,8 @@ class Swaps:
         root = np.linalg.inv(np.linalg.cholesky(beside[:, rows]))
         shared, own = root @ beside, root @ flat[rows]
         left = (flat - shared.T @ own).reshape(count, k, p)
-        every = np.arange(count)
-        blocks = shared.reshape(-1, count, k).transpose(1, 2, 0)
-        alone = self.covariance.reshape(count, k, count, k)[every, :, every, :]
-        alone = alone - blocks @ np.swapaxes(blocks, 1, 2)
+        blocks = shared.T.reshape(count, k, -1)
+        alone = self.alone - blocks @ np.swapaxes(blocks, 1, 2)
         alone[others] = np.eye(k)  # what is there already adds nothing, and nothing new comes with it
         return self.prior + own.T @ own, left, alone
 
@@ -89,8 +95,9 @@ class Swaps:
         matrix, left, alone = self.added(others)
         if isinstance(self.criterion, Accuracy):
             inverse = np.linalg.inv(ridged(matrix[None])[0])
-            seen = left @ inverse
-            gain = (seen @ self.criterion.weight) @ np.swapaxes(seen, 1, 2)
+            flat = left.reshape(-1, left.shape[2]) @ inverse  # a large product takes a third of many small ones
+            seen, turned = (rows.reshape(left.shape) for rows in (flat, flat @ self.criterion.weight))
+            gain = turned @ np.swapaxes(seen, 1, 2)
             whole = alone + seen @ np.swapaxes(left, 1, 2)
             falls = np.einsum("nij,nji->n", np.linalg.inv(whole), gain)
             variance = float(np.sum(self.criterion.weight * inverse)) - falls
