@@ -7,9 +7,10 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import yaml
 
 from calib_planner import Plan, Robot
 from calib_planner.io import parse_urdf
@@ -44,6 +45,11 @@ MIXED_URDF = """<?xml version="1.0"?>
 def repeats(sample: T, every: T) -> T:
     """The seeds, turns or examples of a test: a sample, or with ``make prove`` every one."""
     return every if PROVE else sample
+
+
+def read_yaml(path: Path) -> Any:
+    """What a YAML file says, by libyaml where that is there: Python takes seconds for a large one."""
+    return yaml.load(path.read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
 
 
 def mixed() -> Robot:

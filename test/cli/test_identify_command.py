@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from identify_runs import Run, fails, small_data
-from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations
+from robots import MIXED_URDF, SHARED_DATA, mixed, random_configurations, read_yaml
 
 from calib_planner import Measurements, Robot
 from calib_planner.cli import main
@@ -340,7 +339,7 @@ def test_irb120_with_its_held_out_files(run: Run, tmp_path: Path) -> None:
     ratio = result["left_out"]["rms"] / result["left_out"]["predicted_rms"]
     assert 0.67 < ratio < 1.5
     assert result["verdict"]["level"] in ("PASS", "WARN")
-    document = yaml.safe_load(output.read_text())
+    document = read_yaml(output)
     assert document["validation"] == result["validation"] and document["parameters"] == result["parameters"]
     robot = Robot.load(IRB / "irb120.urdf")
     again = read_estimate(output).calibrated(robot)

@@ -198,10 +198,14 @@ def _inside(folder: Path) -> Iterator[None]:
 # ── reading ──────────────────────────────────────────────────────────────────────────────────────────
 
 
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""Python takes seconds for a large file."""
+
+
 def content(path: Path) -> Any:
     """What a file says, by the ending of its name."""
     if path.suffix in (".yaml", ".yml"):
-        return yaml.safe_load(path.read_text())
+        return yaml.load(path.read_text(), LOADER)
     if path.suffix == ".json":
         return json.loads(path.read_text())
     if path.suffix == ".csv":
