@@ -925,7 +925,11 @@ def _usual(problem: LinearProblem) -> LinearProblem:
 
 def _station(points: FloatArray, centre: FloatArray) -> FloatArray:
     """(N, 3·targets, 6) columns of a motion of the station: translation, then rotation about ``centre``."""
-    turn = np.stack([np.cross(unit, points - centre) for unit in np.eye(3)], axis=-1)
+    arms = points - centre
+    turn = np.zeros((*arms.shape, 3))
+    for axis in range(3):  # the unit vector of the axis × arm
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        turn[..., u, axis], turn[..., v, axis] = -arms[..., v], arms[..., u]
     move = np.broadcast_to(np.eye(3), turn.shape)
     return np.concatenate([move, turn], axis=-1).reshape(len(points), -1, 6)
 
@@ -1141,7 +1145,8 @@ class _Gross:
         if before.spare < SPARE:
             return None
         if before.level < GROSS * self._extent(self.q):
-            return self._elsewhere(self._fitted(plain, self.q, self.p, FIT_ROUNDS, True))
+            every = len(self.q) <= MOST_ROWS  # then that was a fit of all rows already
+            return self._elsewhere(before if every else self._fitted(plain, self.q, self.p, FIT_ROUNDS, True))
         base, after = self._units(plain, before)
         limit = SOUND * self._extent(base.q)
         # What could not be placed at all leaves as much as the points spread.
@@ -1349,7 +1354,8 @@ class _Gross:
     def _left(self, change: _Change, *, fit: bool = False) -> _Left:
         """What is left with base and targets placed as far as they are unknown; ``fit``: and zeros fitted."""
         rows = np.flatnonzero(~np.isnan(change.p[:, :, 0]).all(axis=1))
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_ROWS).astype(int))]
+        if len(rows) > MOST_ROWS:
+            rows = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_ROWS).astype(int))]
         try:
             return self._fitted(change, change.q[rows], change.p[rows], FIT_ROUNDS if fit else RANK_ROUNDS, fit)
         except (NotEnoughDataError, np.linalg.LinAlgError):

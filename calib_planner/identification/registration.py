@@ -181,8 +181,9 @@ def _without_thickness(p: FloatArray, root: FloatArray) -> FloatArray:
 
     d takes up the centre. Noise across the plane of a robot that moves in one would tell a column of C.
     """
-    p = p - np.average(p, axis=0, weights=root**2)
-    squares, axes = np.linalg.eigh(p.T @ (p * root[:, None] ** 2))
+    weights = root[:, None] ** 2
+    p = p - np.sum(p * weights, axis=0) / np.sum(weights, axis=0)
+    squares, axes = np.linalg.eigh(p.T @ (p * weights))
     return p - np.outer(p @ axes[:, 0], axes[:, 0]) if squares[0] < THIN**2 * squares[2] else p
 
 

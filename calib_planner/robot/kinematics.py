@@ -127,13 +127,17 @@ class Tracer:
 
     def node(self, op: str, a: int, b: int = 0, vector: bool | None = None) -> Ref:
         """The node of an operation; ``vector`` is said where ``a`` and ``b`` are no nodes."""
-        key = (op, a, b)
+        return 1, self._number((op, a, b), vector)
+
+    def _number(self, key: tuple[str, int, int], vector: bool | None = None) -> int:
         number = self._known.get(key)
         if number is None:
             number = self._known[key] = len(self.nodes)
             self.nodes.append(key)
-            self.is_vector.append(self.is_vector[a] or self.is_vector[b] if vector is None else vector)
-        return 1, number
+            if vector is None:
+                vector = self.is_vector[key[1]] or self.is_vector[key[2]]
+            self.is_vector.append(vector)
+        return number
 
     def mul(self, x: Ref, y: Ref) -> Ref:
         (sign, a), (other, b) = x, y
@@ -142,17 +146,17 @@ class Tracer:
             return ZERO
         if a == 0 or b == 0:
             return sign, a or b
-        return sign, self.node("mul", *((a, b) if a < b else (b, a)))[1]
+        return sign, self._number(("mul", a, b) if a < b else ("mul", b, a))
 
     def add(self, x: Ref, y: Ref) -> Ref:
         (sign, a), (other, b) = x, y
         if sign == 0 or other == 0:
             return y if sign == 0 else x
         if sign == other:
-            return sign, self.node("add", *((a, b) if a < b else (b, a)))[1]
+            return sign, self._number(("add", a, b) if a < b else ("add", b, a))
         if a == b:
             return ZERO
-        return self.node("sub", *((a, b) if sign > 0 else (b, a)))
+        return 1, self._number(("sub", a, b) if sign > 0 else ("sub", b, a))
 
     def sub(self, x: Ref, y: Ref) -> Ref:
         return self.add(x, (-y[0], y[1]))
