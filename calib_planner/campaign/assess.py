@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from calib_planner.arrays import FloatArray
 from calib_planner.campaign.problem import CampaignProblem, Round
-from calib_planner.campaign.state import FIT, CampaignState
+from calib_planner.campaign.state import FIT, CampaignState, Measurement, together
 from calib_planner.error_model import ErrorModel, gravity_of, typical
 from calib_planner.identification import Estimate, IdentificationProblem, identify
 from calib_planner.measurements import Measurements, configuration_labels
@@ -113,10 +113,14 @@ def assess(state: CampaignState) -> Assessment | None:
         NotEnoughDataError: Too few measurements that agree.
         InputError: The points look like millimetres.
     """
-    data = state.data(FIT)
-    if data is None:
-        return None
-    problem = identification_problem(state.problem, data)
+    fit = state.measurements_of(FIT)
+    return _assessed(state.problem, fit) if fit else None
+
+
+@lru_cache(maxsize=1)
+def _assessed(campaign: CampaignProblem, fit: tuple[Measurement, ...]) -> Assessment:
+    """``assess`` of these measurements, remembered: after the validation it is the one that ended the fit."""
+    problem = identification_problem(campaign, together(campaign, fit))
     return Assessment(problem, identify(problem))
 
 

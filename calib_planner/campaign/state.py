@@ -19,6 +19,7 @@ The measurements are all that cannot be made again: ``from_measurements`` begins
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -180,12 +181,7 @@ class CampaignState:
     def data(self, role: str = FIT) -> Measurements | None:
         """The same as the library's value, or ``None``; with standard deviations if all have some."""
         rows = self.measurements_of(role)
-        if not rows:
-            return None
-        q, points = np.array([r.q for r in rows]), np.array([r.points for r in rows])
-        stated = [r.std for r in rows if r.std is not None]
-        std = np.array(stated) if len(stated) == len(rows) else None
-        return Measurements(self.problem.robot.joint_names, q, points, std)
+        return together(self.problem, rows) if rows else None
 
     def spent(self, role: str | None = None) -> int:
         """Measurements made, those that failed included; skipped and unreachable configurations cost none."""
@@ -351,6 +347,14 @@ class CampaignState:
     def _check_index(self, index: int) -> None:
         if not 0 <= index < len(self.configurations):
             raise InputError("index", index, f"a configuration, 0 to {len(self.configurations) - 1}")
+
+
+def together(problem: CampaignProblem, rows: Sequence[Measurement]) -> Measurements:
+    """One or more measurements as the library's value; with standard deviations if all have some."""
+    q, points = np.array([r.q for r in rows]), np.array([r.points for r in rows])
+    stated = [r.std for r in rows if r.std is not None]
+    std = np.array(stated) if len(stated) == len(rows) else None
+    return Measurements(problem.robot.joint_names, q, points, std)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from calib_planner.campaign import (
 from calib_planner.campaign.assess import assess, expected
 from calib_planner.campaign.finish import APART
 from calib_planner.error_model import gravity_of, typical
-from calib_planner.identification import IdentificationProblem
+from calib_planner.identification import Estimate, IdentificationProblem
 from calib_planner.planning import Search, plan_for_accuracy
 from calib_planner.robot.masses import LinkMass
 from calib_planner.simulation import simulated
@@ -93,6 +94,19 @@ def test_same_seed_same_campaign():
     results = [campaign(planar(seed=4), world_of(planar().robot, 4)) for _ in range(2)]
     np.testing.assert_array_equal(results[0].fit.p, results[1].fit.p)
     assert results[0].to_dict()["rounds"] == results[1].to_dict()["rounds"]
+
+
+def test_nothing_is_identified_twice(monkeypatch):
+    """The fit's end and the result after the validation are of the same measurements."""
+    module, sizes = importlib.import_module("calib_planner.campaign.assess"), []
+
+    def counted(problem: IdentificationProblem) -> Estimate:
+        sizes.append(len(problem.data))
+        return identify(problem)
+
+    monkeypatch.setattr(module, "identify", counted)
+    result = campaign(planar(seed=4), world_of(planar().robot, 4))
+    assert len(result.validation) and len(result.fit) in sizes and len(set(sizes)) == len(sizes)
 
 
 @pytest.mark.parametrize("seed", repeats([1], [0, 1, 2, 3]))

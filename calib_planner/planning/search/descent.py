@@ -101,8 +101,9 @@ def descend(
         moved = drop > 0
         # A failed search restarts from steepest descent once before the row is given up.
         lost, over = ~moved & ~fresh, ~moved & fresh
-        update(inverse, fresh, np.flatnonzero(moved), (new_x - x)[moved], (new_gradient - gradient)[moved])
-        inverse[lost], fresh[lost] = np.eye(size), True
+        update(inverse, fresh, np.arange(len(x)), new_x - x, new_gradient - gradient)
+        if lost.any():
+            inverse[lost], fresh[lost] = np.eye(size), True
         x, value, gradient = new_x, new_value, new_gradient
         idle = np.where(moved & (drop > tolerance), 0, idle + 1)
         go_on = ~over & (idle < 2)
@@ -124,12 +125,10 @@ def _direction(
     x: FloatArray, g: FloatArray, inverse: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     bound = bound_coordinates(x, g, low, high)
-    free_g = np.where(bound, 0.0, g)
-    direction = -np.matmul(inverse, free_g[:, :, None])[:, :, 0]
-    direction[bound] = 0.0
+    steepest = np.where(bound, 0.0, -g)
+    direction = np.where(bound, 0.0, np.matmul(inverse, steepest[:, :, None])[:, :, 0])
     uphill = (direction * g).sum(axis=1) >= 0
-    direction[uphill] = -free_g[uphill]
-    return direction
+    return np.where(uphill[:, None], steepest, direction) if uphill.any() else direction
 
 
 def _lengths(rows: FloatArray) -> FloatArray:
@@ -148,17 +147,21 @@ def _line_search(
     high: FloatArray,
     mend: Mend,
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-    best_x, best_value, best_g = x.copy(), value.copy(), g.copy()
-    open_rows = np.arange(len(x))
+    best_x, best_value, best_g = x, value, g
+    open_rows: IntArray = np.arange(len(x))
     used = 0
-    for _ in range(HALVINGS):
+    for step in range(HALVINGS):
         trial = mend(x, np.minimum(np.maximum(x + scale[:, None] * direction, low), high))
         f, df = objective(trial)
-        used += len(open_rows)
+        used += len(f)
         decrease = (g * (trial - x)).sum(axis=1)
         good = np.isfinite(f) & (f <= value + ARMIJO * decrease) & (f < value)
-        hit = open_rows[good]
-        best_x[hit], best_value[hit], best_g[hit] = trial[good], f[good], df[good]
+        if step == 0:  # of all rows, and most often the last
+            best_x, best_value = np.where(good[:, None], trial, x), np.where(good, f, value)
+            best_g = np.where(good[:, None], df, g)
+        else:
+            hit = open_rows[good]
+            best_x[hit], best_value[hit], best_g[hit] = trial[good], f[good], df[good]
         if good.all():
             break
         open_rows, x, value, g, direction, scale = (
@@ -176,7 +179,8 @@ def update(inverse: FloatArray, fresh: NDArray[np.bool_], rows: IntArray, s: Flo
     """BFGS update of the inverse Hessians of ``rows``, scaled at first use, skipped where s·y ≤ 0."""
     sy = (s * y).sum(axis=1)
     good = sy > 1e-10 * _lengths(s) * _lengths(y)
-    rows, s, y, sy = rows[good], s[good], y[good], sy[good]
+    if not good.all():
+        rows, s, y, sy = rows[good], s[good], y[good], sy[good]
     beside = max(CACHED // s.shape[1] ** 2, 1)
     for part in (slice(first, first + beside) for first in range(0, len(rows), beside)):
         inverse[rows[part]] = _updated(inverse[rows[part]], fresh[rows[part]], s[part], y[part], sy[part])
