@@ -56,7 +56,7 @@ from calib_planner.report import provenance, write_report
 from calib_planner.robot import Robot
 from calib_planner.ros.messages import duration_message, plan_from_message, seconds_of
 from calib_planner.ros.parameters import EVENTS, LATCHED
-from calib_planner.ros.processes import Nodes, own_domain
+from calib_planner.ros.processes import Nodes, own_domain, undisturbed
 from calib_planner.units import length
 
 ATTEMPT = 8.0
@@ -255,13 +255,20 @@ def run_demo(configurations: int, seed: int, folder: Path, screen: Screen) -> De
     Raises:
         CalibPlannerError: The error says what failed, with the last lines of a node that ended.
     """
-    with own_domain() as domain, Nodes(folder / "log", domain) as nodes:
+    with own_domain() as domain, undisturbed() as signals, Nodes(folder / "log", domain) as nodes:
+
+        def check() -> None:
+            """Not in the middle of what rclpy does: there KeyboardInterrupt can become another exception."""
+            if signals:
+                raise KeyboardInterrupt
+            nodes.check()
+
         screen.say("starting planner, identifier and simulated tracker")
         nodes.start("planner_node", {"robot": ROBOT, "error_model": ERROR_MODEL})
         save = {"save_folder": f"'{folder.resolve()}'", "samples": SAMPLES, "sigma": SIGMA}
         nodes.start("identifier_node", {"robot": ROBOT} | save)
         nodes.start("simulator_node", {"robot": ROBOT, "seed": seed, "sigma": SIGMA, "error_model": ERROR_MODEL})
-        client = DemoClient(domain, nodes.check)
+        client = DemoClient(domain, check)
         try:
             plan = _measure(configurations, seed, client, screen)
             screen.say("saving")

@@ -140,7 +140,7 @@ class Nodes:
     def end_one(self, module: str, number: signal.Signals = signal.SIGINT) -> int:
         """End one node and set its log aside, so that it may be started again; returns its exit status."""
         child = next(c for c in self._children if c.name == module)
-        with _undisturbed():
+        with undisturbed():
             status = self._end(number, [child])[module]
         self._children.remove(child)
         child.log.rename(child.log.with_suffix(f".{child.process.pid}.log"))
@@ -160,7 +160,7 @@ class Nodes:
 
     def end(self, number: signal.Signals = signal.SIGINT) -> dict[str, int]:
         """End all nodes; returns the exit status of each (negative: had to be killed)."""
-        with _undisturbed():
+        with undisturbed():
             return self._end(number, self._children)
 
     def _end(self, number: signal.Signals, children: Sequence[_Child]) -> dict[str, int]:
@@ -202,20 +202,23 @@ def _abort(process: subprocess.Popen[bytes]) -> None:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def undisturbed() -> Iterator[list[int]]:
     """Let Ctrl-C wait meanwhile: it must not leave nodes behind, and it is not lost either.
+
+    Yields:
+        The signals that have come; what takes long looks at it now and then.
 
     Raises:
         KeyboardInterrupt: Afterwards, if a signal came that this process handles.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     came: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
     handled = [n for n in (signal.SIGINT, signal.SIGTERM) if callable(signal.getsignal(n))]
     before = {n: signal.signal(n, lambda number, frame: came.append(number)) for n in handled}
     try:
-        yield
+        yield came
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -170,7 +170,7 @@ def test_a_signal_while_nodes_are_ended_waits_and_is_not_lost(number: signal.Sig
     outer = signal.signal(number, signal.default_int_handler)
     ended = False
     try:
-        with pytest.raises(KeyboardInterrupt), processes._undisturbed():
+        with pytest.raises(KeyboardInterrupt), processes.undisturbed():
             os.kill(os.getpid(), number)
             ended = True
         assert ended and signal.getsignal(number) is signal.default_int_handler

@@ -131,6 +131,9 @@ try:
         executor.spin_once(5.0)
 except BaseException as error:
     order.append(type(error).__name__)
+until = time.monotonic() + 30.0
+while not {own} and rclpy.ok() and time.monotonic() < until:
+    time.sleep(0.01)  # a thread of rclpy's shuts the context down
 print(*order, rclpy.ok())
 """
 

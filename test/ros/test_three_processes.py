@@ -144,6 +144,6 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, number: signa
             time.sleep(0.05)
         demo_process.send_signal(number)
         out, err = demo_process.communicate(timeout=60.0)
-    assert demo_process.returncode == 130
+    assert demo_process.returncode == 130, err
     assert out == "" and "interrupted" in err and "Traceback" not in err
     assert not running_with(str(tmp_path))
