@@ -122,6 +122,21 @@ class ExtendedModel:
         return Isotropic(self.model.values["floor"]) if noise is None else noise
 
     @property
+    def even(self) -> bool:
+        """Whether a point's noise is the same wherever it is measured."""
+        return self.model.points.noise is None or isinstance(self.model.points.noise, Isotropic)
+
+    def points_at(self, poses: Poses) -> FloatArray:
+        """(N, 3·targets, 3·targets) what is new at each visit and point, without the joints' part [m²]."""
+        r = self.still.visit_covariance(poses) / self.times
+        return np.asarray(r + self.configuration_sigma**2 * np.eye(r.shape[-1]))
+
+    @cached_property
+    def even_points(self) -> FloatArray:
+        """``points_at`` anywhere, where noise is ``even``: (1, 3·targets, …); with (N,) repetitions (N, …)."""
+        return self.points_at(Poses(self.robot, np.zeros((1, len(self.robot.joint_names)))))
+
+    @property
     def size(self) -> int:
         """p."""
         return int(self.maps.shape[2])
@@ -275,8 +290,8 @@ class LinearisedExtension:
     @cached_property
     def points(self) -> FloatArray:
         """(N, 3·targets, 3·targets) what is new at each visit and point, without the joints' part [m²]."""
-        r = self.model.still.visit_covariance(self.poses) / self.model.times
-        return np.asarray(r + self.model.configuration_sigma**2 * np.eye(r.shape[-1]))
+        own = self.model.even_points if self.model.even else self.model.points_at(self.poses)
+        return np.broadcast_to(own, (len(self.poses), *own.shape[1:]))
 
     def kernels(self, size: int, counts: FloatArray | None = None) -> FloatArray:
         """(joints, N/size, size, size) what the errors of a joint have in common within each run.
@@ -411,13 +426,12 @@ class LinearisedExtension:
         size, robot, model = n // len(parts[0][1]), self.model.robot, self.model.model
         force: FloatArray = np.zeros((len(parts[0][1]), size * rows, p))
         on_points, on_joints = (np.zeros((len(force), size * rows, size * rows)) for _ in range(2))
-        even = model.points.noise is None or isinstance(model.points.noise, Isotropic)
         for factor, by_matrix in parts:
             solved, scales = self._solved(size, factor)[1], self.model.column_scales(factor)
             z = solved @ (by_matrix if factor == 1.0 else by_matrix * scales[:, None] * scales)
             k = z @ np.swapaxes(solved, 1, 2)
             force += z
-            if not even:
+            if not self.model.even:
                 on_points += k
             k *= factor**2
             on_joints += k
@@ -431,7 +445,7 @@ class LinearisedExtension:
             rates = model.gravity.moment_gradients(self.poses) * model.values["gravity"]
             by_joint += (np.sum(own * self._gravity_levers, axis=1)[:, None] @ rates)[:, 0]
         self._add_kernels(on_joints, size, by_lever, by_joint)
-        if not even:
+        if not self.model.even:
             self._add_noise(on_points, size, by_joint)
         return by_joint + self._pulled(force, by_lever)
 

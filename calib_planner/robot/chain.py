@@ -357,8 +357,19 @@ class Robot(Told):
             joint: Number of the joint that moves the link; ``None``: the tip.
             xyz: (3,) the point in the frame of the link, or of the tip [m].
         """
-        moved, trunk = np.ascontiguousarray(self.motions(self._check_q(q)).T), self._trunk_to(joint)
-        point = np.array(xyz, float)
+        key = (joint, *xyz)
+        if key not in self._links:
+            self._links[key] = self._link(joint, np.array(xyz, float))
+        program, amounts = self._links[key]
+        return program.run(np.ascontiguousarray(self.motions(self._check_q(q)).T), amounts).T
+
+    @cached_property
+    def _links(self) -> dict[tuple[float | None, ...], tuple[Program, FloatArray]]:
+        return {}
+
+    def _link(self, joint: int | None, point: FloatArray) -> tuple[Program, FloatArray]:
+        """The program and the amounts of ``link_points`` for one point (3,)."""
+        trunk = self._trunk_to(joint)
         amounts = np.concatenate([self._nominal_amounts[: len(trunk)], point])
         own = codes_of(point, np.zeros(len(POINT), bool))
         codes = np.concatenate([self._nominal_codes[: len(trunk)], own])
@@ -366,7 +377,7 @@ class Robot(Told):
         def structure() -> Structure:
             return structure_of(trunk, (POINT,), codes.tolist(), (), ())
 
-        return self._remembered(("link", codes.tobytes()), structure).run(moved, amounts).T
+        return self._remembered(("link", codes.tobytes()), structure), amounts
 
     def _trunk_to(self, joint: int | None) -> tuple[Element, ...]:
         """The elements up to the link that a joint moves; ``None``: up to the tip."""
