@@ -1,6 +1,8 @@
 /* Copyright 2026 calib_planner contributors */
 /* SPDX-License-Identifier: Apache-2.0 */
-/* How configurations share the errors of their joints, without an array call per joint; see extended.py.
+/* What planning does with many small numbers, without an array call for each step.
+ *
+ * How configurations share the errors of their joints; see extended.py.
  *
  * With levers c (N, rows, joints), N = S·m configurations in S runs of m, and kernels κ (joints, S, m, m),
  *
@@ -9,10 +11,18 @@
  *                 by_lever(i, l) −= 2 Σ_j κ_l(i, j) u ,   by_joint(i, l) −= 2 Σ_j change_l(i, j) c_l(q_i) · u ,
  *
  * out and weights (S, m·rows, m·rows), changes (joints, S, m, m) the derivative of κ_l(i, j) by joint l of i, by_lever
- * (N, rows, joints), by_joint (N, joints). All arrays contiguous, float64; κ_l(i, j) = κ_l(j, i). Nothing is returned.
+ * (N, rows, joints), by_joint (N, joints); κ_l(i, j) = κ_l(j, i).
+ *
+ *     bend(forms, out):     the largest second difference of N boxes (N, s_1, …, s_k) along each axis, out (N, k); see
+ *                           certify/branch_and_bound.py,
+ *     turn(inverse, step, scaled, weighted):     inverse (rows, D, D) ← inverse − u sᵀ − s uᵀ + w sᵀ, with s, u and w
+ *                           the other arguments, (rows, D) each; see search/descent.py.
+ *
+ * These two give what NumPy gives to the last digit. All arrays contiguous, float64. Nothing is returned.
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <math.h>
 #include <string.h>
 
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__linux__)
@@ -125,11 +135,105 @@ static PyObject *couple_back(PyObject *self, PyObject *const *arguments, Py_ssiz
     Py_RETURN_NONE;
 }
 
+#define MOST_AXES 16
+
+/* Four running maxima: one would wait for itself. */
+VECTORISED static double largest_bend(const double *low, Py_ssize_t after) {
+    double most[4] = {0.0, 0.0, 0.0, 0.0};
+    for (Py_ssize_t a = 0; a < after; a++) {
+        const double second = fabs(low[2 * after + a] - 2.0 * low[after + a] + low[a]);
+        most[a & 3] = second > most[a & 3] ? second : most[a & 3];
+    }
+    for (int k = 1; k < 4; k++) most[0] = most[k] > most[0] ? most[k] : most[0];
+    return most[0];
+}
+
+static void bends(const double *forms, Py_ssize_t boxes, int axes, const Py_ssize_t *shape, double *out) {
+    Py_ssize_t whole = 1;
+    for (int k = 0; k < axes; k++) whole *= shape[k];
+    for (Py_ssize_t n = 0; n < boxes; n++) {
+        const double *const form = forms + n * whole;
+        for (Py_ssize_t k = 0, after = whole; k < axes; k++) {
+            const Py_ssize_t run = after; /* coefficients of this axis and of those behind it */
+            after /= shape[k];
+            double most = 0.0;
+            for (Py_ssize_t first = 0; first < whole; first += run)
+                for (Py_ssize_t i = 0; i + 2 < shape[k]; i++) {
+                    const double bend = largest_bend(form + first + i * after, after);
+                    most = bend > most ? bend : most;
+                }
+            out[n * axes + k] = most;
+        }
+    }
+}
+
+VECTORISED static void turn_one(Py_ssize_t D, double *h, const double *s, const double *u, const double *w) {
+    for (Py_ssize_t i = 0; i < D; i++)
+        for (Py_ssize_t j = 0; j < D; j++) h[i * D + j] = h[i * D + j] - u[i] * s[j] - u[j] * s[i] + w[i] * s[j];
+}
+
+/* The arrays, of which those from ``written`` on may be written to; their number, or 0 with an error. */
+static int buffers(PyObject *const *arguments, Py_ssize_t given, int wanted, unsigned written, Py_buffer *view) {
+    int have = 0;
+    for (; given == wanted && have < wanted; have++)
+        if (PyObject_GetBuffer(arguments[have], &view[have], written >> have & 1 ? PyBUF_CONTIG : PyBUF_CONTIG_RO) < 0 ||
+            view[have].itemsize != 8)
+            break;
+    if (have == wanted) return 1;
+    if (PyErr_Occurred() == NULL) {
+        PyErr_SetString(PyExc_ValueError, "the arrays do not fit each other, or are not float64");
+        have += given == wanted;
+    }
+    while (have--) PyBuffer_Release(&view[have]);
+    return 0;
+}
+
+static PyObject *released(Py_buffer *view, int count, int right) {
+    for (int k = 0; k < count; k++) PyBuffer_Release(&view[k]);
+    if (right) Py_RETURN_NONE;
+    PyErr_SetString(PyExc_ValueError, "the arrays do not fit each other, or are not float64");
+    return NULL;
+}
+
+static PyObject *bend(PyObject *self, PyObject *const *arguments, Py_ssize_t count) {
+    Py_buffer view[2];
+    (void)self;
+    if (!buffers(arguments, count, 2, 2u, view)) return NULL;
+    const int axes = view[0].ndim - 1;
+    const int right = axes >= 1 && axes <= MOST_AXES && view[1].ndim == 2 && view[1].shape[0] == view[0].shape[0] &&
+                      view[1].shape[1] == axes && view[0].len > 0;
+    if (right) {
+        Py_BEGIN_ALLOW_THREADS
+        bends(view[0].buf, view[0].shape[0], axes, view[0].shape + 1, view[1].buf);
+        Py_END_ALLOW_THREADS
+    }
+    return released(view, 2, right);
+}
+
+static PyObject *turn(PyObject *self, PyObject *const *arguments, Py_ssize_t count) {
+    Py_buffer view[4];
+    (void)self;
+    if (!buffers(arguments, count, 4, 1u, view)) return NULL;
+    const Py_ssize_t rows = view[0].ndim == 3 ? view[0].shape[0] : -1, D = view[0].ndim == 3 ? view[0].shape[1] : -1;
+    int right = rows >= 0 && view[0].shape[2] == D;
+    for (int k = 1; k < 4; k++) right = right && view[k].ndim == 2 && view[k].shape[0] == rows && view[k].shape[1] == D;
+    if (right) {
+        double *const h = view[0].buf;
+        const double *const s = view[1].buf, *const u = view[2].buf, *const w = view[3].buf;
+        Py_BEGIN_ALLOW_THREADS
+        for (Py_ssize_t n = 0; n < rows; n++) turn_one(D, h + n * D * D, s + n * D, u + n * D, w + n * D);
+        Py_END_ALLOW_THREADS
+    }
+    return released(view, 4, right);
+}
+
 static PyMethodDef methods[] = {
+    {"bend", (PyCFunction)(void (*)(void))bend, METH_FASTCALL, "see kernel.c"},
+    {"turn", (PyCFunction)(void (*)(void))turn, METH_FASTCALL, "see kernel.c"},
     {"couple", (PyCFunction)(void (*)(void))couple, METH_FASTCALL, "see kernel.c"},
     {"couple_back", (PyCFunction)(void (*)(void))couple_back, METH_FASTCALL, "see kernel.c"},
     {NULL, NULL, 0, NULL},
 };
-static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", "Coupling of extended.py, in C.", -1, methods};
+static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", "Inner loops of planning, in C.", -1, methods};
 
 PyMODINIT_FUNC PyInit__kernel(void) { return PyModule_Create(&module); }

@@ -15,7 +15,7 @@ from calib_planner import InputError, PlanProblem, Robot
 from calib_planner.error_model import Prior, typical
 from calib_planner.planning import Custom, Feasibility, InformationModel, plan_space, random_plans
 from calib_planner.planning.criteria import Determinant, log_values, ridged
-from calib_planner.planning.search import enumeration
+from calib_planner.planning.search import descent, enumeration
 from calib_planner.planning.search.apart import nearest, repelling
 from calib_planner.planning.search.descent import (
     _direction,
@@ -53,6 +53,21 @@ def test_a_step_of_the_inverse_hessian_is_bfgs() -> None:
         np.testing.assert_allclose(inverse[row] @ change, step, rtol=1e-9)
     np.testing.assert_array_equal(inverse[[2, 4]], before[[2, 4]])
     assert fresh.tolist() == [False, False, False, False, True]
+
+
+@pytest.mark.skipif(descent._turn is None, reason="the kernel is not built here")
+@pytest.mark.parametrize("shape", [(1, 1), (5, 6), (3, 17)], ids=str)
+def test_the_compiled_step_of_the_inverse_hessian_is_numpys(shape: tuple[int, int]) -> None:
+    """To the last digit, so that plans are the same with it and without."""
+    rng = np.random.default_rng(0)
+    got, (s, u, w) = rng.normal(size=(*shape, shape[1])), rng.normal(size=(3, *shape))
+    want = got.copy()
+    descent._turn(got, s, u, w)
+    descent.turn_numpy(want, s, u, w)
+    np.testing.assert_array_equal(got, want)
+    for wrong in ((got, s, u), (got, s, u, w[:, None]), (got, s, u, w.astype(np.float32)), (s, s, u, w)):
+        with pytest.raises(ValueError, match="fit"):
+            descent._turn(*wrong)
 
 
 def test_a_direction_goes_down_and_through_no_bound() -> None:

@@ -23,6 +23,11 @@ import numpy as np
 from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.planning.certify.bernstein import Axis, first_boxes, halves
 
+try:
+    from calib_planner.planning._kernel import bend as _bend
+except ImportError:  # not built, or an older one: NumPy does the same, more slowly
+    _bend = None
+
 CHUNK = 2**20
 """Coefficients handled at once: 8 MB."""
 DEEPEST = 40
@@ -172,8 +177,7 @@ class _Search:
     def _split(self, boxes: _Boxes) -> _Boxes:
         """Halve every box along the axis in which its coefficients bend most, axis by axis."""
         shape, k = boxes.forms.shape, len(self.axes)
-        bends = [_bend(boxes.forms.reshape(len(boxes), -1, shape[j + 1], _after(shape, j))) for j in range(k)]
-        chosen = np.argmax(bends, axis=0)
+        chosen = np.argmax(bends(boxes.forms), axis=1)
         parts = []
         for j, axis in enumerate(self.axes):
             rows = np.flatnonzero(chosen == j)
@@ -196,7 +200,23 @@ def _after(shape: tuple[int, ...], axis: int) -> int:
     return int(np.prod(shape[axis + 2 :]))
 
 
-def _bend(forms: FloatArray) -> FloatArray:
+def bends(forms: FloatArray) -> FloatArray:
+    """(N, k) largest second differences of N boxes (N, …) along each of their k axes."""
+    if _bend is None or not forms.flags.c_contiguous:
+        return bends_numpy(forms)
+    out = np.empty((len(forms), forms.ndim - 1))
+    _bend(forms, out)
+    return out
+
+
+def bends_numpy(forms: FloatArray) -> FloatArray:
+    """``bends`` without the compiled kernel."""
+    shape = forms.shape
+    every = (forms.reshape(len(forms), -1, shape[j + 1], _after(shape, j)) for j in range(len(shape) - 1))
+    return np.stack([_along_third(each) for each in every], axis=1)
+
+
+def _along_third(forms: FloatArray) -> FloatArray:
     """(N,) largest second difference of (N, before, size, after) along its third axis."""
     second = 2.0 * forms[:, :, 1:-1]
     np.subtract(forms[:, :, 2:], second, out=second)

@@ -27,6 +27,11 @@ from calib_planner.planning.criteria import Criterion, log_values, ridged
 from calib_planner.planning.feasibility import Feasibility
 from calib_planner.planning.information import InformationModel
 
+try:
+    from calib_planner.planning._kernel import turn as _turn
+except ImportError:  # not built, or an older one: NumPy does the same, more slowly
+    _turn = None
+
 Objective = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Maps X (rows, D) to values (rows,) and gradients (rows, D)."""
 
@@ -194,11 +199,16 @@ def _updated(h: FloatArray, first: NDArray[np.bool_], s: FloatArray, y: FloatArr
     hy = np.matmul(h, y[:, :, None])[:, :, 0]
     rho = 1.0 / sy
     weight = rho * (1.0 + rho * (y * hy).sum(axis=1))
-    cross = (rho[:, None] * hy)[:, :, None] * s[:, None, :]
+    (_turn or turn_numpy)(h, s, rho[:, None] * hy, weight[:, None] * s)
+    return h
+
+
+def turn_numpy(h: FloatArray, s: FloatArray, u: FloatArray, w: FloatArray) -> None:
+    """H − u sᵀ − s uᵀ + w sᵀ of each row, in place, as the compiled kernel does; (rows, D, D) and (rows, D)."""
+    cross = u[:, :, None] * s[:, None, :]
     h -= cross
     h -= cross.transpose(0, 2, 1)
-    h += np.multiply((weight[:, None] * s)[:, :, None], s[:, None, :], out=cross)
-    return h
+    h += np.multiply(w[:, :, None], s[:, None, :], out=cross)
 
 
 # ── random feasible steps ─────────────────────────────────────────────────────────────────────────────
