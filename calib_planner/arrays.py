@@ -20,6 +20,8 @@ from calib_planner.errors import InputError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
@@ -27,6 +29,15 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     copy = np.array(array, order="C", copy=True)
     copy.setflags(write=False)
     return copy
+
+
+def remembered(known: dict[K, V], key: K, most: int, make: Callable[[], V]) -> V:
+    """The value of a key, made where it is not known; of more than ``most`` keys the oldest is forgotten."""
+    if key not in known:
+        if len(known) >= most:
+            known.pop(next(iter(known)))
+        known[key] = make()
+    return known[key]
 
 
 def plain(value: Any, *, keep_infinite: bool = False, keep_nan: bool = False) -> Any:

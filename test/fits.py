@@ -10,7 +10,7 @@ import numpy as np
 from robots import random_configurations
 
 from calib_planner import Robot
-from calib_planner.arrays import FloatArray
+from calib_planner.arrays import FloatArray, IntArray
 from calib_planner.error_model import ErrorModel, JointFunctions, Placement, typical
 from calib_planner.error_model.knowledge import Knowledge
 from calib_planner.identification.estimation import _Work
@@ -38,6 +38,13 @@ def ur10e(targets: int = 2) -> Robot:
 def unknown(robot: Robot) -> Robot:
     """The same with base and tool unknown."""
     return robot.with_parameters("full", ("base", "tool"))
+
+
+def of_visits(problem: LinearProblem, rows: IntArray) -> LinearProblem:
+    """The same for some visits, by number; one may come several times."""
+    parts = {name: part[rows] for name, part in problem.parts.items()}
+    y, columns, seen = problem.y[rows], problem.columns[rows], problem.seen[rows]
+    return replace(problem, y=y, columns=columns, parts=parts, seen=seen, poses=None)
 
 
 def simulated(

@@ -33,7 +33,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib_planner.arrays import FloatArray, IntArray
+from calib_planner.arrays import FloatArray, IntArray, remembered
 from calib_planner.error_model import ErrorModel, Knowledge, Payload, Poses
 from calib_planner.errors import NotEnoughDataError
 from calib_planner.identification.doubt import (
@@ -270,14 +270,13 @@ class _Work:
 
     def _poses(self, coefficients: FloatArray) -> Poses:
         """Parameters and deflected joints at β (coefficients,)."""
-        known, key = self._known, coefficients.tobytes()
-        if key not in known:
-            if len(known) >= MOST_POSES:
-                known.pop(next(iter(known)))
+
+        def poses() -> Poses:
             model, here = self.state.model, self.here(coefficients)
             readings = Poses(here, self.data.q, model.payloads(self.data.payload, len(self.data)))
-            known[key] = model.deflected(readings, coefficients)
-        return known[key]
+            return model.deflected(readings, coefficients)
+
+        return remembered(self._known, coefficients.tobytes(), MOST_POSES, poses)
 
     def apart(self, coefficients: FloatArray) -> FloatArray:
         """(N, m) measured − predicted at β (coefficients,) [m]; 0 where not measured."""

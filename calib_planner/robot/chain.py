@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib_planner.arrays import FloatArray, check_array, check_configurations, frozen
+from calib_planner.arrays import FloatArray, check_array, check_configurations, frozen, remembered
 from calib_planner.errors import CalibPlannerError, InputError, UnknownNameError
 from calib_planner.robot.coupling import Coupling, coupling_matrix, enclosing_limits
 from calib_planner.robot.elements import Element, roll_pitch_yaw, rotation
@@ -357,19 +357,17 @@ class Robot(Told):
             joint: Number of the joint that moves the link; ``None``: the tip.
             xyz: (3,) the point in the frame of the link, or of the tip [m].
         """
-        key = (joint, *xyz)
-        if key not in self._links:
-            self._links[key] = self._link(joint, np.array(xyz, float))
-        program, amounts = self._links[key]
+        known, key = self._links, (joint, *xyz)
+        program, amounts = remembered(known, key, MOST_PROGRAMS, lambda: self._link(joint, xyz))
         return program.run(np.ascontiguousarray(self.motions(self._check_q(q)).T), amounts).T
 
     @cached_property
     def _links(self) -> dict[tuple[float | None, ...], tuple[Program, FloatArray]]:
         return {}
 
-    def _link(self, joint: int | None, point: FloatArray) -> tuple[Program, FloatArray]:
+    def _link(self, joint: int | None, xyz: Sequence[float]) -> tuple[Program, FloatArray]:
         """The program and the amounts of ``link_points`` for one point (3,)."""
-        trunk = self._trunk_to(joint)
+        trunk, point = self._trunk_to(joint), np.array(xyz, float)
         amounts = np.concatenate([self._nominal_amounts[: len(trunk)], point])
         own = codes_of(point, np.zeros(len(POINT), bool))
         codes = np.concatenate([self._nominal_codes[: len(trunk)], own])
@@ -447,12 +445,7 @@ class Robot(Told):
 
     def _remembered(self, key: tuple[Any, ...], structure: Callable[[], Structure]) -> Program:
         """The program of a structure, remembered by ``key``, which holds the codes and what is wanted."""
-        known = self._programs
-        if key not in known:
-            if len(known) >= MOST_PROGRAMS:
-                known.pop(next(iter(known)))
-            known[key] = compile_program(structure())
-        return known[key]
+        return remembered(self._programs, key, MOST_PROGRAMS, lambda: compile_program(structure()))
 
     def _program(self, amounts: NDArray[Any], columns: Sequence[int], axes: Sequence[int]) -> Program:
         """The compiled chain: the amounts matter by their codes alone, and programs are remembered by them."""

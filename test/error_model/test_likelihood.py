@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import problem_of, simulated, total_covariance, unknown, ur10e
+from fits import of_visits, problem_of, simulated, total_covariance, unknown, ur10e
 from robots import random_configurations
 
 from calib_planner.error_model import ErrorModel, Placement, typical
@@ -233,10 +233,8 @@ def test_visits_that_come_go_and_lose_weight_are_the_same_as_solving_anew(target
     chosen = np.array([*range(8), 10, *range(12, 20)])
 
     def part(rows: np.ndarray, doubt: np.ndarray | None) -> LinearProblem:
-        parts = {n: p[rows] for n, p in whole.parts.items()}
-        parts |= {} if doubt is None else {"doubt": part_of(doubt)}
-        columns, seen = whole.columns[rows], whole.seen[rows]
-        return replace(whole, y=whole.y[rows], columns=columns, parts=parts, seen=seen, poses=None)
+        some = of_visits(whole, rows)
+        return some if doubt is None else replace(some, parts={**some.parts, "doubt": part_of(doubt)})
 
     start = updatable(dense(part(some, None)))
     changed = exchange(start, part(chosen, doubt), np.where(chosen < 14, chosen, -1))
@@ -272,17 +270,8 @@ def test_a_visit_that_alone_tells_a_direction_cannot_be_taken_away() -> None:
     start = updatable(dense(problem_of(3, 1, "flat")))
     problem = start.problem
     rows = np.arange(2)
-    parts = {n: p[rows] for n, p in problem.parts.items()}
-    less = replace(
-        problem,
-        y=problem.y[rows],
-        columns=problem.columns[rows],
-        parts=parts,
-        seen=problem.seen[rows],
-        poses=None,
-    )
     with pytest.raises(np.linalg.LinAlgError):
-        exchange(start, less, rows)
+        exchange(start, of_visits(problem, rows), rows)
 
 
 # ── left out ─────────────────────────────────────────────────────────────────────────────────────────
@@ -299,16 +288,7 @@ def test_left_out_residuals_are_those_of_a_refit_without_the_group(
     for group in (0, 1, 2, 5):
         visits = np.flatnonzero(groups == group)
         rest = np.flatnonzero(groups != group)
-        parts = {n: p[rest] for n, p in problem.parts.items()}
-        part = replace(
-            problem,
-            y=problem.y[rest],
-            columns=problem.columns[rest],
-            parts=parts,
-            seen=problem.seen[rest],
-            poses=None,
-        )
-        without = form(part)
+        without = form(of_visits(problem, rest))
         columns = problem.columns[visits].reshape(-1, problem.columns.shape[2])
         residual = problem.y[visits].ravel() - columns @ without.coefficients
         np.testing.assert_allclose(found.residuals[visits].ravel(), residual, atol=1e-4 * np.abs(residual).max())

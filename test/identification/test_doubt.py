@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import problem_of
+from fits import of_visits, problem_of
 from scipy.stats import chi2
 
 from calib_planner.identification import term_gain
@@ -167,10 +167,7 @@ def test_a_terms_size_and_doubt_are_what_it_moves_the_measured_points(monkeypatc
     assert terms["gravity"].gain == 3.0 and terms["visits"].gain == -1.0 and np.isnan(terms["smooth"].gain)
     assert all(t.used for t in terms.values())
     # Of many visits each so many-th stands for the others: of pairs that are alike the first for both.
-    pairs = np.repeat(np.arange(6), 2)
-    columns, seen = problem.columns[pairs], problem.seen[pairs]
-    many = replace(problem, y=problem.y[pairs], columns=columns, seen=seen, poses=None)
-    many = replace(many, parts={name: part[pairs] for name, part in problem.parts.items()})
+    many = of_visits(problem, np.repeat(np.arange(6), 2))
     monkeypatch.setattr(term_gain, "ENOUGH", 6)
     for term in term_gain.term_gains(model, many, coefficients, half @ half.T, gains):
         assert (term.size, term.std) == pytest.approx((terms[term.name].size, terms[term.name].std), nan_ok=True)
